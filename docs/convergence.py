@@ -95,7 +95,7 @@ def choose_keyframes(trace: Trace, count: int) -> list[Keyframe]:
     some = first[torch.linspace(0, len(first) - 1, count).long()]
     out = [Keyframe(some, some, color_by_weight(np.full(count, 1 / count)))]
     for before, particles in zip(trace.particles, trace.particles[1:], strict=False):
-        weights = normalize_weights(particles, 0)
+        weights = normalize_weights(particles)
         few = choose_by_weight(weights, count)
         few = few[weights[few].argsort(stable=True)]
         after = particles.state[0].detach().cpu().double()[few]

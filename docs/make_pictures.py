@@ -169,7 +169,7 @@ def of_checkpoint(checkpoint: Path, scenes: Path | None, meshes: str, out: Path)
             sample.rgb, K, one.trace.belief, method.object_model, sample.camera_from_object
         ),
     )
-    write(out / "particles.jpg", draw_iterations(sample.rgb, K, one.trace, 0, method.space))
+    write(out / "particles.jpg", draw_iterations(sample.rgb, K, one.trace, method.space))
     searching = method_of(kept, SEARCH)
     sample, _, trace = next(
         run(searching, kept["recipe"]["settings"]["data"], scenes, name, only=BRIGHT)

@@ -1,5 +1,6 @@
 """Results on disk: what is read is what was written, and what is malformed is named."""
 
+import math
 from pathlib import Path
 
 import numpy as np
@@ -127,7 +128,7 @@ def test_outcomes_and_beliefs(tmp_path: Path) -> None:
     belief = BeliefBatch(history, weights.log(), history[:, 1], torch.tensor([1.5, -2.0]))
     empty = torch.zeros(2)
     batch = Batch(empty, empty, empty, empty, empty, empty, torch.tensor([1, 0]), empty)
-    outcomes = collect_outcomes(Trace((), (), (), belief), batch, 0.25)
+    outcomes = collect_outcomes(Trace((), (), (), belief), batch, 0.25, [math.nan] * 2)
     assert [(o.frame_id, o.score, o.seconds) for o in outcomes] == [(1, 1.5, 0.25), (0, -2.0, 0.25)]
     assert (outcomes[0].estimate == history[0, 1].numpy()).all()
     native_from_mesh = poses(1, seed=3)[0]

@@ -116,7 +116,7 @@ def test_close_ups_are_beside_their_frames_however_few_steps_there_are() -> None
         trace = trace_of([pose().expand(5, 4, 4)] * count, [[0] * 5] * count)
         figures = [
             draw_silhouettes(RGB, K, trace, hull, truth, "silhouettes"),
-            draw_iterations(RGB, K, trace, 0, PoseSpace((0.0, 0.0, 0.0), 0.14), "particles"),
+            draw_iterations(RGB, K, trace, PoseSpace((0.0, 0.0, 0.0), 0.14), "particles"),
         ]
         for figure in figures:
             assert figure.shape[1] == WIDTH

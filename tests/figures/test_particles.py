@@ -76,7 +76,7 @@ def test_colors_span_a_tenth_to_ten_times_the_mean() -> None:
 def test_rows_of_pixels_count_particles_off_the_frame() -> None:
     states = torch.tensor([[[10.0, 10.0], [30.0, 20.0]], [[12.0, 10.0], [300.0, 20.0]]])
     trace = trace_of(states, torch.full((2, 2), 0.5))
-    figure = draw_iterations(RGB, K, trace, 0, PixelSpace())
+    figure = draw_iterations(RGB, K, trace, PixelSpace())
     assert figure.shape[1] == WIDTH
     title = round(TITLE * 1.25) + round(CAPTION * 1.25)
     # below "step 0" and "step 1"
@@ -86,7 +86,7 @@ def test_rows_of_pixels_count_particles_off_the_frame() -> None:
     assert measure_off_frame(
         np.array([[-0.4, 59.4], [79.6, 0.0], [0.0, -0.6]]), 60, 80
     ) == pytest.approx(2 / 3)
-    assert describe_step(trace, 0, 1, "px") == "step 1: noise 0.02 px, 100% effective"
+    assert describe_step(trace, 1, "px") == "step 1: noise 0.02 px, 100% effective"
 
 
 def test_rows_of_poses_puts_dots_on_projected_centers() -> None:
@@ -94,7 +94,7 @@ def test_rows_of_poses_puts_dots_on_projected_centers() -> None:
     # its center at (0.1, -0.05, 0.8) -> (49.5, 24.5) px
     pose = make_pose(torch.eye(3), torch.tensor([0.1, -0.05, 0.7]))
     trace = trace_of(pose.expand(3, 50, 4, 4), torch.full((3, 50), 0.02))
-    figure = draw_iterations(RGB, K, trace, 0, space)
+    figure = draw_iterations(RGB, K, trace, space)
     color = color_by_weight(np.full(50, 0.02))[0].astype(int)
     found = np.argwhere(np.abs(figure.astype(int) - color).max(-1) < 8)
     u, v = full_view(60, 80, tile_width(2)).place(np.array([49.5, 24.5]))
@@ -102,7 +102,7 @@ def test_rows_of_poses_puts_dots_on_projected_centers() -> None:
     top = frame[:, 0].mean() - v
     assert abs(frame[:, 1].mean() - 6 - u) < 2
     assert abs(top - round(TITLE * 1.25) - round(CAPTION * 1.25)) < 3
-    assert "noise 40 mm" in describe_step(trace, 0, 0, "mm")
+    assert "noise 40 mm" in describe_step(trace, 0, "mm")
 
 
 def test_axes_are_drawn_by_weight() -> None:

@@ -74,8 +74,8 @@ def test_the_cloud_and_the_photograph_are_there_at_every_step(tmp_path: Path) ->
     scene = shown()
     record(scene, tmp_path / "view.rrd")
     found = read_back(tmp_path / "view.rrd", "step")
-    assert np.allclose(found["/cloud"]["Points3D:positions"][None], scene.points, atol=1e-6)
-    assert (rgba(found["/cloud"]["Points3D:colors"][None])[:, :3] == scene.colors).all()
+    assert np.allclose(found["/cloud"]["Points3D:positions"][None], scene.cloud.points, atol=1e-6)
+    assert (rgba(found["/cloud"]["Points3D:colors"][None])[:, :3] == scene.cloud.colors).all()
     assert (found["/photograph"]["Image:buffer"][None].reshape(H, W, 3) == scene.rgb).all()
     K = found["/photograph"]["Pinhole:image_from_camera"][None].reshape(3, 3).T
     # its pixels' corners are whole

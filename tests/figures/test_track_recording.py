@@ -9,7 +9,8 @@ import pytest
 from rrd_files import read_back
 
 from posefilter.errors import UserError
-from posefilter.figures.track_recording import Seen, TrackRecorder, thin_cloud
+from posefilter.figures.track_recording import Seen, TrackRecorder
+from posefilter.figures.view_data import make_cloud
 from posefilter.meshes.builtin import catalog as builtin
 
 H, W = 24, 32
@@ -34,7 +35,7 @@ def test_points_of_the_cloud_project_onto_the_pixels_that_they_are_of() -> None:
     depth = DEPTH.copy()
     depth[:, :16] = 0
     depth[4, 20] = np.nan
-    points, colors, footprints = thin_cloud(RGB, depth, K)
+    points, colors, footprints = make_cloud(RGB, depth, K, every=4)
     pixels = points @ K.T
     column, row = (pixels[:, :2] / pixels[:, 2:]).T.round().astype(int)
     assert len(points) == 4 * 6 - 1

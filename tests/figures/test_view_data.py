@@ -35,17 +35,18 @@ def second(pixels: bool = False, **changes: torch.Tensor) -> ViewData:
 
 def test_cloud_is_the_depth_back_projected_in_the_photographs_colors() -> None:
     shown, batch = second(), two_images()
+    cloud = shown.cloud
     K, found = batch.intrinsics[1].double().numpy(), 0
     for v in range(H):
         for u in range(W):
             z = float(batch.depth[1, 0, v, u])
             if z > 0:
                 ray = np.linalg.inv(K) @ [u, v, 1.0]
-                assert np.allclose(shown.points[found], ray * z, atol=1e-9)
-                assert np.allclose(shown.colors[found], batch.rgb[1, :, v, u] * 255, atol=0.51)
-                assert shown.footprints[found] == pytest.approx(z / 10)
+                assert np.allclose(cloud.points[found], ray * z, atol=1e-9)
+                assert np.allclose(cloud.colors[found], batch.rgb[1, :, v, u] * 255, atol=0.51)
+                assert cloud.footprints[found] == pytest.approx(z / 10)
                 found += 1
-    assert found == len(shown.points) == len(shown.colors) < H * W
+    assert found == len(cloud.points) == len(cloud.colors) < H * W
     assert shown.rgb.shape == (H, W, 3)
 
 
@@ -140,4 +141,4 @@ def test_every_method_with_a_pose_can_be_shown(model: str, tmp_path: Path) -> No
     assert shown.estimate.weight + sum(
         m.weight for m in shown.others
     ) + shown.left_out == pytest.approx(1)
-    assert len(shown.points) == toy.H * toy.W
+    assert len(shown.cloud.points) == toy.H * toy.W

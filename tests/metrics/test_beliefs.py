@@ -86,7 +86,7 @@ def test_the_collected_block() -> None:
     truth = truths(6, g)
     poses = around(truth, 0.002, 80, g)
     belief = BeliefBatch(poses, torch.full((6, 80), -math.log(80)), truth, torch.zeros(6))
-    metric = BeliefQuality([MODEL])
+    metric = BeliefQuality(MODEL)
     metric.update(BeliefBatch(*(x[:2] for x in belief)), truth[:2])
     metric.update(BeliefBatch(*(x[2:] for x in belief)), truth[2:])
     found = metric.compute()

@@ -9,9 +9,9 @@ from posefilter.metrics.diagnostics import (
     FilterDiagnostics,
     auroc,
     distinct,
+    is_off_frame,
     line_share,
     near_edge,
-    off_frame,
     offset_cosine,
     pairwise_cosine,
     r2_score,
@@ -58,7 +58,7 @@ def test_auroc_equals_counting_pairs() -> None:
 
 def test_shares_of_particles_on_object_at_edges_and_in_corners() -> None:
     state = torch.tensor([[[100.0, 50.0], [122.0, 50.0], [2.0, 2.0], [100.0, 99.0], [-5.0, 50.0]]])
-    assert off_frame(state, 200, 100).item() == pytest.approx(0.2)
+    assert is_off_frame(state, 200, 100).float().mean().item() == pytest.approx(0.2)
     edge, corner = near_edge(state, 200, 100)
     assert edge.item() == pytest.approx(0.6)
     assert corner.item() == pytest.approx(0.2)

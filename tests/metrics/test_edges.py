@@ -36,7 +36,7 @@ from posefilter.metrics.errors import add, add_up_to_symmetry
 from posefilter.metrics.image_errors import parse_row, read_errors, summarize_errors
 from posefilter.metrics.parts import PartIoU, label_pixels
 from posefilter.metrics.results import compute_checkpoint_score, flatten
-from posefilter.metrics.scores import auc, median_mm, overall, recall
+from posefilter.metrics.scores import auc, median, overall, recall
 from posefilter.metrics.tracks import measure_jitter
 from posefilter.metrics.vsd import TAUS
 from posefilter.types import BeliefBatch
@@ -260,8 +260,8 @@ def test_scores_at_their_limits() -> None:
     assert recall(errors, 0.021) == 50
     assert auc(errors, 0.05) == pytest.approx(100 * 0.5)  # half from 0 on; the other is no hit
     assert auc(errors, 0.2) == pytest.approx(100 * (0.02 * 0.5 + 0.03 + 0.15) / 0.2)
-    assert median_mm(torch.tensor([0.001, 0.002, 0.004, 0.1])) == pytest.approx(3)
-    assert median_mm(torch.tensor([0.004, 0.001, 0.002])) == pytest.approx(2)
+    assert median(torch.tensor([0.001, 0.002, 0.004, 0.1])) == pytest.approx(0.003)
+    assert median(torch.tensor([0.004, 0.001, 0.002])) == pytest.approx(0.002)
     assert overall(None, 0.5, 0.25) == pytest.approx(37.5)
     assert overall(71.0, 0.5, 0.25) == 71
 
@@ -293,12 +293,12 @@ def belief_at(shifts: list[float], log_w: torch.Tensor) -> BeliefBatch:
     return BeliefBatch(poses, log_w[None], poses[:, 0], log_w[None, 0])
 
 
-def test_the_quality_of_a_belief_of_two_objects_by_hand() -> None:
+def test_the_quality_of_a_belief_by_hand() -> None:
     """Mass within 0.1 diameters and within 2 cm; the object's own diameter counts."""
     log_w = torch.tensor([0.5, 0.3, 0.2]).log()
     belief = belief_at([0.0, 0.015, 0.025], log_w)
-    large = BeliefQuality([MODEL._replace(diameter=0.1), MODEL])  # 10 and 28 mm
-    large.update(belief, torch.eye(4)[None], torch.tensor([1]))
+    large, small = BeliefQuality(MODEL), BeliefQuality(MODEL._replace(diameter=0.1))  # 28, 10 mm
+    large.update(belief, torch.eye(4)[None])
     found = large.compute()
     assert found["mass_01d"] == pytest.approx(1.0)
     assert found["mass_2cm"] == pytest.approx(0.8)
@@ -306,14 +306,14 @@ def test_the_quality_of_a_belief_of_two_objects_by_hand() -> None:
     mean = 0.3 * 0.015 + 0.2 * 0.025
     square_mean = 0.3 * 0.015**2 + 0.2 * 0.025**2
     assert found["spread_m"] == pytest.approx(math.sqrt(square_mean - mean**2), rel=1e-4)
-    large.update(belief, torch.eye(4)[None], torch.tensor([0]))
-    assert large.compute()["mass_01d"] == pytest.approx((1.0 + 0.5) / 2)
-    assert BeliefQuality([MODEL]).compute() == {}
+    small.update(belief, torch.eye(4)[None])
+    assert small.compute()["mass_01d"] == pytest.approx(0.5)
+    assert BeliefQuality(MODEL).compute() == {}
 
 
 def test_coverage_counts_ranks_up_to_its_level() -> None:
     """The truth lies as deep as the best particle, then outside all."""
-    metric = BeliefQuality([MODEL])
+    metric = BeliefQuality(MODEL)
     log_w = torch.full((4,), -math.log(4))
     belief = belief_at([0.0, 0.01, 0.02, 0.5], log_w)
     metric.update(belief, torch.eye(4)[None])

@@ -80,7 +80,7 @@ KINDS: dict[str, tuple[Callable[..., Metric], Callable[[Any, slice], None]]] = {
         lambda metric, part: metric.update(BATCH.mask[part], PIXELS[part]),
     ),
     "belief": (
-        lambda **kwargs: BeliefQuality([MODEL], **kwargs),
+        lambda **kwargs: BeliefQuality(MODEL, **kwargs),
         lambda metric, part: metric.update(belief_of(part), TRUTH[part]),
     ),
     "credibility": (

@@ -13,7 +13,7 @@ from posefilter.geometry.boxes import box_iou, box_of_pose
 from posefilter.geometry.camera import intrinsics
 from posefilter.geometry.pose import make_pose
 from posefilter.metrics.collect import BoxIoU, ParticlesOnObject, PoseErrors
-from posefilter.metrics.scores import auc, median_mm, recall, summarize
+from posefilter.metrics.scores import auc, median, recall, summarize
 from posefilter.types import ObjectModel
 
 POINTS = torch.tensor([[x, y, z] for x in (-0.1, 0.1) for y in (-0.1, 0.1) for z in (-0.1, 0.1)])
@@ -61,15 +61,15 @@ def test_both_ends() -> None:
     assert auc(torch.full((4,), math.inf)) == 0
     assert auc(torch.full((4,), 0.1)) == 0
     assert math.isnan(auc(torch.zeros(0)))
-    assert math.isnan(median_mm(torch.zeros(0)))
+    assert math.isnan(median(torch.zeros(0)))
 
 
 def test_recall_and_median() -> None:
     errors = torch.tensor([0.001, 0.015, 0.03, math.inf])
     assert recall(errors, 0.02) == 50
     assert recall(errors, torch.tensor([0.0001, 0.02, 0.04, 1.0])) == 50
-    assert median_mm(errors) == pytest.approx(22.5)
-    assert median_mm(errors[[0, 3, 3]]) == math.inf
+    assert median(errors) == pytest.approx(0.0225)
+    assert median(errors[[0, 3, 3]]) == math.inf
     with pytest.raises(UserError, match="NaN"):
         summarize(torch.tensor([math.nan]), 0.1)
 

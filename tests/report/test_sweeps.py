@@ -2,11 +2,14 @@
 
 import json
 import shutil
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
 
 from posefilter.errors import UserError
+from posefilter.metrics.image_errors import FILE, ImageError, write_errors
 from posefilter.metrics.registry import find_metric
 from posefilter.report.gather import read_run
 from posefilter.report.sweep_charts import chart_over
@@ -124,6 +127,25 @@ def test_summary_alone_is_enough(tmp_path: Path) -> None:
     page, files = content.render(), content.files()
     assert "those of summary.csv" in page
     assert "add-auc-filter-particles.png" in files
+
+
+def test_tables_are_read_as_they_are_written_whatever_the_locale(tmp_path: Path) -> None:
+    """A file that is opened in the locale's encoding is a warning, and here an error."""
+    write_errors(
+        tmp_path / FILE, [ImageError(0, 0, 1, "box", "K\xfcche/0", 1.0, 2.0, 1.0, 90.0, 1, 0, 0)]
+    )
+    summary = tmp_path / "summary.csv"
+    summary.write_text("data.root,add_auc,folder\nK\xfcche,50,a\n", encoding="utf-8")
+    code = (
+        "import sys, warnings; from pathlib import Path;"
+        "from posefilter.metrics.image_errors import read_errors;"
+        "from posefilter.report.sweeps import read_jobs_from_csv;"
+        "warnings.simplefilter('error', EncodingWarning);"
+        "assert read_errors(Path(sys.argv[1]))[0].image == 'K\\xfcche/0';"
+        "assert read_jobs_from_csv(Path(sys.argv[2]))[1][0].place == {'data.root': 'K\\xfcche'}"
+    )
+    strict = [sys.executable, "-X", "warn_default_encoding", "-c", code]
+    subprocess.run([*strict, tmp_path / FILE, summary], check=True)
 
 
 def test_mistakes_are_one_line(sweep: Path, run: Path, tmp_path: Path) -> None:

@@ -105,17 +105,14 @@ class Diagnostics(TraceCallback):
         for i in range(min(self.images, len(states))):
             rgb, mask = to_image(batch.rgb[i]), batch.mask[i, 0].cpu().numpy()
             name = name_frame(trainer, "test", int(batch.frame_id[i]))
-            picture = draw_trajectories(
-                rgb, mask, states[i].cpu().numpy(), f"Trajectories\n{name} of the test"
-            )
+            title = f"Trajectories\n{name} of the test"
+            picture = draw_trajectories(rgb, mask, states[i].cpu().numpy(), title)
             post_image(trainer, f"trajectories_{i}", picture, self.folder, "test")
-            K, truth = (
-                x[i].cpu().double().numpy() for x in (batch.intrinsics, batch.camera_from_object)
-            )
+            pair = (batch.intrinsics, batch.camera_from_object)
+            K, truth = (x[i].cpu().double().numpy() for x in pair)
             scene = AnimatedScene(rgb, K, truth, mask)
-            animation = animate(
-                method, select_image(trace, i), scene, f"The filter at work\n{name} of the test"
-            )
+            title = f"The filter at work\n{name} of the test"
+            animation = animate(method, select_image(trace, i), scene, title)
             post_image(trainer, f"animation_{i}", animation, self.folder, "test")
 
 

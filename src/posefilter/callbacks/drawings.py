@@ -6,7 +6,7 @@ Pictures are (H, W, 3) uint8; bytes are an animation, a GIF.
 
 from collections.abc import Callable
 from functools import wraps
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 import torch
@@ -93,20 +93,14 @@ def worst(o: Occasion) -> Drawn:
 def particles(o: Occasion) -> Drawn:
     """Draw the particles on the image, colored by weight."""
     title = o.title("Particles by iteration")
-    return draw_iterations(o.one.rgb, o.one.intrinsics, o.trace, 0, o.method.space, title)
+    return draw_iterations(o.one.rgb, o.one.intrinsics, o.trace, o.method.space, title)
 
 
 @needs("pose")
 def belief(o: Occasion) -> Drawn:
     """Draw the belief on SO(3) and over translation."""
-    return draw_belief(
-        o.one.rgb,
-        o.one.intrinsics,
-        o.trace.belief,
-        o.method.object_model,
-        o.one.truth,
-        o.title("Belief"),
-    )
+    known = (o.trace.belief, o.method.object_model, o.one.truth)
+    return draw_belief(o.one.rgb, o.one.intrinsics, *known, o.title("Belief"))
 
 
 @needs("pose_space")
@@ -122,21 +116,13 @@ def silhouettes(o: Occasion) -> Drawn:
 def field(o: Occasion) -> Drawn:
     """Draw slices of the score about the truth."""
     assert isinstance(o.method, ScoresPoses)
-    object_model = o.method.object_model
-    found = evaluate_pose_field(
-        o.method,
-        o.encoding,
-        o.batch.camera_from_object[0],
-        object_model,
-        choose_levels(o.trace.steps),
-    )
+    object_model, truth = o.method.object_model, o.batch.camera_from_object[0]
+    levels = choose_levels(o.trace.steps)
+    found = evaluate_pose_field(o.method, o.encoding, truth, object_model, levels)
     center = object_model.center.cpu().double().numpy()
-    shift = (
-        (o.one.estimate[:3, :3] - o.one.truth[:3, :3]) @ center
-        + o.one.estimate[:3, 3]
-        - o.one.truth[:3, 3]
-    )
-    return draw_pose_field(found, o.title("Likelihood field"), o.one.truth[:3, :3].T @ shift)
+    R, t = o.one.truth[:3, :3], o.one.truth[:3, 3]
+    shift = (o.one.estimate[:3, :3] - R) @ center + o.one.estimate[:3, 3] - t
+    return draw_pose_field(found, o.title("Likelihood field"), R.T @ shift)
 
 
 @needs("score_points")
@@ -144,50 +130,29 @@ def points(o: Occasion) -> Drawn:
     """Draw slices of the likelihood of single points through the object's frame (the paper, figure
     5).
     """
-    likelihood = getattr(o.method, "likelihood", None)
-    if not isinstance(likelihood, ScoresPoints):
-        return None
+    likelihood = cast(ScoresPoints, o.method.likelihood)
     object_model, truth = o.method.object_model, o.batch.camera_from_object[0]
+    of, levels = (likelihood, o.encoding.image, truth, object_model), choose_levels(o.trace.steps)
     slices = [
-        evaluate_point_field(
-            likelihood,
-            o.encoding.image,
-            truth,
-            object_model,
-            pixel,
-            on,
-            choose_levels(o.trace.steps),
-            depthwise,
-        )
+        evaluate_point_field(*of, pixel, on, levels, depthwise)
         for pixel, on in choose_pixels(o.batch, object_model)
         for depthwise in ((False, True) if on else (False,))
     ]
+    if not slices:
+        return None
     surface = (object_model.points - object_model.center).cpu().double().numpy()
-    return (
-        draw_point_field(slices, o.one.rgb, surface, o.title("Likelihood of points"))
-        if slices
-        else None
-    )
+    return draw_point_field(slices, o.one.rgb, surface, o.title("Likelihood of points"))
 
 
 @needs("object_coordinates")
 def proposals(o: Occasion) -> Drawn:
     """Draw what the proposal network says."""
-    if not isinstance(o.method, ProposesPoses):
-        return None
+    assert isinstance(o.method, ProposesPoses)
     predicted = predict_proposals(o.method, o.encoding, o.batch, o.method.object_model)
     if predicted is None:
         return None
-    title = o.title("Proposals")
-    return draw_proposals(
-        predicted,
-        o.one.rgb,
-        o.one.intrinsics,
-        o.one.truth,
-        o.shape,
-        o.method.object_model.radius,
-        title,
-    )
+    image, radius = (o.one.rgb, o.one.intrinsics, o.one.truth), o.method.object_model.radius
+    return draw_proposals(predicted, *image, o.shape, radius, o.title("Proposals"))
 
 
 @needs("pixel_space")
@@ -196,7 +161,7 @@ def objectness(o: Occasion) -> Drawn:
     if getattr(o.encoding, "objectness", None) is None:
         return None
     history = [
-        (c.state[0].double().numpy(), normalize_weights(c, 0).numpy())
+        (c.state[0].double().numpy(), normalize_weights(c).numpy())
         for c in (o.trace.particles[0], o.trace.particles[-1])
     ]
     seen = o.encoding.objectness[0, 0].detach().float().cpu().numpy()
@@ -238,24 +203,16 @@ class AnimatedScene(NamedTuple):
 def animate(method: PoseEstimator, trace: Trace, scene: AnimatedScene, title: str) -> bytes:
     """Animate the filter on one image, whose trace this is.  -> a GIF."""
     hull, K = method.object_model.hull.cpu(), scene.intrinsics
-    posed = isinstance(method.space, PoseSpace)
-    target = (
-        outline_hulls(project_hulls(torch.as_tensor(scene.truth)[None], hull, K))
-        if posed
-        else trace_outline(scene.mask)
-    )
-    return encode_gif(
-        list(Animation(scene.rgb, K, trace, method.space, hull, target, title).frames())
-    )
+    target = trace_outline(scene.mask)
+    if isinstance(method.space, PoseSpace):
+        target = outline_hulls(project_hulls(torch.as_tensor(scene.truth)[None], hull, K))
+    shown = Animation(scene.rgb, K, trace, method.space, hull, target, title)
+    return encode_gif(list(shown.frames()))
 
 
 def _gallery(o: Occasion, kind: str, title: str) -> Drawn:
-    images = o.kept[kind]
-    return (
-        draw_gallery(images, o.shape, "pose" in o.method.capabilities, f"{title}\n{o.when}")
-        if images
-        else None
-    )
+    images, posed = o.kept[kind], "pose" in o.method.capabilities
+    return draw_gallery(images, o.shape, posed, f"{title}\n{o.when}") if images else None
 
 
 DRAWINGS: dict[str, Drawing] = {

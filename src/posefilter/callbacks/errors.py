@@ -82,7 +82,7 @@ def measure_batch(
     if "pose" in method.capabilities:
         poses = method.scores["poses"]
         assert isinstance(poses, PoseErrors)
-        errors = [(1000 * state[-1]).tolist() for state in (poses.add, poses.add_s, poses.diameter)]
+        errors = (1000 * poses.rows[-1]).T.tolist()
     shares = on_object(batch.mask, method.particle_pixels(trace.particles[-1], batch)).tolist()
     seconds = method.seconds_per_image[-1] if method.seconds_per_image else math.nan
     scores, times = trace.belief.score.tolist(), [seconds] * count

@@ -73,21 +73,18 @@ def evaluate_pose_field(
     degrees = torch.tensor(
         sorted({0.0, *_FINE, *(-d for d in _FINE), *np.arange(-180.0, 181.0, 15.0).tolist()})
     )
-    about = turn_pose(truth, center, degrees.to(truth) * math.pi / 180)
-    extents = tuple(
-        min(max(6 * sigma, object_model.radius / 4), 2 * object_model.radius) for sigma in sigmas
-    )
+    turned = turn_pose(truth, center, degrees.to(truth) * math.pi / 180).flatten(0, -3)
+    radius = object_model.radius
+    extents = tuple(min(max(6 * sigma, radius / 4), 2 * radius) for sigma in sigmas)
     planes, turns = [], []
     for sigma, extent in zip(sigmas, extents, strict=True):
-        poses = torch.cat(
-            [truth[None], shift_pose(truth, extent, cells).flatten(0, -3), about.flatten(0, -3)]
-        )
+        shifted = shift_pose(truth, extent, cells).flatten(0, -3)
+        poses = torch.cat([truth[None], shifted, turned])[None]
         generator = torch.Generator(device=truth.device).manual_seed(0)
         # as the filter reads
         with torch.autocast(truth.device.type, torch.bfloat16, enabled=fast_bfloat16(truth.device)):
-            score = (
-                method.score_poses(encoding, poses[None], sigma, generator, pixels)[0].float().cpu()
-            )
+            found = method.score_poses(encoding, poses, sigma, generator, pixels)
+        score = found[0].float().cpu()
         less = (score - score[0])[1:].numpy()
         planes.append(less[: 3 * cells * cells].reshape(3, cells, cells))
         turns.append(less[3 * cells * cells :].reshape(3, len(degrees)))
@@ -146,17 +143,12 @@ def evaluate_point_field(
         asked[None, None],
         *(alike(x) for x in (points.color, points.ray, points.known, points.inside)),
     )
+    radius = object_model.radius
     if image.context is not None:  # what the proposal network says of the place that is asked for
         u, v = (torch.full((1, 1, len(asked)), float(x), device=truth.device) for x in pixel)
-        many = many._replace(
-            context=query(image.context, u, v, many.position / object_model.radius)
-        )
-    found = torch.stack(
-        [
-            likelihood.score_points(many, sigma, center, object_model.radius)[0, 0].float().cpu()
-            for sigma in sigmas
-        ]
-    ).numpy()
+        many = many._replace(context=query(image.context, u, v, many.position / radius))
+    judged = [likelihood.score_points(many, sigma, center, radius)[0, 0] for sigma in sigmas]
+    found = torch.stack([one.float().cpu() for one in judged]).numpy()
     scores = found[:, 1:].reshape(len(sigmas), cells, cells)
     return PointField(
         pixel, on, place.cpu().numpy(), plane, extent, tuple(sigmas), scores, found[:, 0]
@@ -193,17 +185,11 @@ def choose_pixels(batch: Batch, object_model: ObjectModel) -> list[tuple[tuple[i
     best = [int(within.argmax())]
     grid = pixel_grid(H, W, device=batch.depth.device).reshape(1, -1, 2)
     points = back_project(grid, batch.depth.flatten(1), batch.intrinsics)
-    away = (
-        (transform(invert(batch.camera_from_object), points)[0] - object_model.center.to(points))
-        .norm(dim=-1)
-        .cpu()
-        .numpy()
-    )
+    local = transform(invert(batch.camera_from_object), points)[0] - object_model.center.to(points)
+    away = np.abs(local.norm(dim=-1).cpu().numpy() - object_model.radius)
     off = (distance_transform_edt(~mask) > 4) & known
     if off.any():
-        best.append(
-            int(np.where(off.reshape(-1), np.abs(away - object_model.radius), np.inf).argmin())
-        )
+        best.append(int(np.where(off.reshape(-1), away, np.inf).argmin()))
     return [((i % W, i // W), number == 0) for number, i in enumerate(best)]
 
 
@@ -220,12 +206,8 @@ def predict_proposals(
     center = object_model.center.to(batch.depth)
     generator = torch.Generator(device=batch.depth.device).manual_seed(0)
     poses = method.propose_poses(encoding, drawn, generator)[0].cpu().double()
-    axes = project_axes(
-        poses,
-        object_model.center.cpu().double(),
-        0.5 * object_model.radius,
-        batch.intrinsics[0].cpu().double(),
-    )
+    middle, K = object_model.center.cpu().double(), batch.intrinsics[0].cpu().double()
+    axes = project_axes(poses, middle, 0.5 * object_model.radius, K)
     truth, _, usable = true_coordinates(
         encoding.cells, batch.mask, batch.camera_from_object, center, object_model.radius
     )

@@ -96,12 +96,8 @@ class Figures(TraceCallback):
             name = name_frame(trainer, "val", int(batch.frame_id[i]))
             self._selection.offer(error, partial(keep_image, trace, batch, method, i, error, name))
             if self._example is None:
-                one = keep_image(trace, batch, method, i, error, name)
-                self._example = (
-                    one,
-                    select_image(trace, 0),
-                    Batch(*(x[:1].clone() for x in batch)),
-                )
+                one, own = keep_image(trace, batch, method, i, error, name), select_image(trace, 0)
+                self._example = (one, own, Batch(*(x[:1].clone() for x in batch)))
 
     def on_validation_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Draw, or put it off."""
@@ -113,8 +109,8 @@ class Figures(TraceCallback):
             return
         if trainer.is_global_zero:
             kept, step = self._selection.kept, trainer.global_step
-            method = _method(pl_module)
-            self.budget.draw(partial(self._draw, trainer, method, self._example, kept, step))
+            assert isinstance(pl_module, PoseEstimator)
+            self.budget.draw(partial(self._draw, trainer, pl_module, self._example, kept, step))
 
     def on_fit_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Draw the last validation, if that was put off."""
@@ -151,8 +147,3 @@ def evaluate_quietly(method: PoseEstimator) -> Iterator[None]:
     finally:
         for module, training in before:
             module.training = training
-
-
-def _method(module: LightningModule) -> PoseEstimator:
-    assert isinstance(module, PoseEstimator)
-    return module

@@ -140,9 +140,8 @@ def draw_gallery(
     tiles = arrange_grid([draw_tile(one, shape, tells_pose) for one in kept], _COLUMNS)
     if not tells_pose:
         return compose_figure(title, tiles, draw_weight_scale())
-    return compose_figure(
-        title, tiles, draw_legend([("truth", TRUTH), ("estimate", ESTIMATE), *list_axes()])
-    )
+    legend = draw_legend([("truth", TRUTH), ("estimate", ESTIMATE), *list_axes()])
+    return compose_figure(title, tiles, legend)
 
 
 def draw_tile(one: KeptImage, shape: Shape, tells_pose: bool) -> np.ndarray:

@@ -49,28 +49,30 @@ class Records(TraceCallback):
     ) -> None:
         """Take in one batch."""
         times = method.seconds_per_image
-        found = collect_outcomes(trace, batch, times[-1] if times else math.nan)
-        probabilities = method.last_assessment(len(found)).probability.tolist()
-        self.outcomes += [
-            one._replace(probability=probability)
-            for one, probability in zip(found, probabilities, strict=True)
-        ]
+        seconds = times[-1] if times else math.nan
+        probabilities = method.last_assessment(len(batch.rgb)).probability.tolist()
+        self.outcomes += collect_outcomes(trace, batch, seconds, probabilities)
 
 
-def collect_outcomes(trace: Trace, batch: Batch, seconds: float) -> list[Outcome]:
+def collect_outcomes(
+    trace: Trace, batch: Batch, seconds: float, probabilities: Sequence[float]
+) -> list[Outcome]:
     """Return the outcome of each image of a batch.
 
     Args:
         trace: The run of the filter.
         batch: Its B images.
         seconds: That an image took.
+        probabilities: Of the B estimates; NaN where the method is not calibrated.
     """
     belief = trace.belief
     best = belief.best.detach().cpu().double().numpy()
     poses = belief.poses.detach().cpu().float().numpy()
     weights = belief.log_weights.detach().exp().cpu().float().numpy()
     return [
-        Outcome(frame, best[i], float(belief.score[i]), seconds, poses[i], weights[i])
+        Outcome(
+            frame, best[i], float(belief.score[i]), seconds, poses[i], weights[i], probabilities[i]
+        )
         for i, frame in enumerate(batch.frame_id.tolist())
     ]
 

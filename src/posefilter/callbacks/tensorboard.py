@@ -1,14 +1,15 @@
 """Hand figures to TensorBoard and to the run's folder, and keep count of what drawing costs."""
 
-import struct
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from io import BytesIO
 from pathlib import Path
 
 import numpy as np
 from lightning import Trainer
 from lightning.pytorch.loggers import TensorBoardLogger
+from PIL import Image
 from tensorboard.compat.proto.summary_pb2 import Summary
 from torch.utils.tensorboard.writer import FileWriter
 
@@ -61,7 +62,7 @@ def post_image(
     packed, suffix = (drawn, ".gif") if isinstance(drawn, bytes) else (to_jpeg(drawn), ".jpg")
     tag = name_tag(name, stage)
     if tag is not None:
-        width, height = measure_size(drawn)
+        width, height = Image.open(BytesIO(packed)).size
         image = Summary.Image(height=height, width=width, colorspace=3, encoded_image_string=packed)
         for writer in get_writers(trainer):
             writer.add_summary(
@@ -70,14 +71,6 @@ def post_image(
             )
     if folder is not None:
         write_whole(folder / f"{stage}_{name}{suffix}", packed)
-
-
-def measure_size(drawn: np.ndarray | bytes) -> tuple[int, int]:
-    """Return width and height of a picture, or of a GIF, which has them in its head [px]."""
-    if isinstance(drawn, bytes):
-        width, height = struct.unpack("<HH", drawn[6:10])
-        return width, height
-    return drawn.shape[1], drawn.shape[0]
 
 
 def get_writers(trainer: Trainer) -> list[FileWriter]:

@@ -29,7 +29,7 @@ def follow_particles(trace: Trace, max_particles: int = 8) -> Tensor:
     """Return the ways of a few particles of one image, chosen by their last weight.  -> (T, n, 2)
     [px].
     """
-    chosen = choose_by_weight(normalize_weights(trace.particles[-1], 0), max_particles).unique()
+    chosen = choose_by_weight(normalize_weights(trace.particles[-1]), max_particles).unique()
     return trace_lineage(trace.particles)[0][:, chosen]
 
 

@@ -12,9 +12,9 @@ from omegaconf import OmegaConf
 
 from posefilter.cli.ablations import (
     ABLATIONS,
+    BY_NAME,
     SIZE,
     Ablation,
-    find_parent,
     list_detector_ablations,
     list_pose_ablations,
     list_pose_space_ablations,
@@ -29,7 +29,7 @@ def resolve_overrides(ablation: Ablation) -> tuple[str, dict[str, str]]:
     """
     chain = [ablation]
     while not chain[0].parent.startswith("variant="):
-        chain.insert(0, find_parent(chain[0]))
+        chain.insert(0, BY_NAME[chain[0].parent])
     pairs = [override.partition("=") for step in chain for override in step.overrides]
     return chain[0].parent.partition("=")[2], {key: value for key, _, value in pairs}
 

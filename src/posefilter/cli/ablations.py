@@ -228,16 +228,7 @@ _NOT_OF_DETECTORS = (
     "s3_balanced", "s5_position", "s6_informed", "s8_resample", "s9_displacement_loss_and_position",
     "c3_bounded", "c4_balanced", "c5_displacement_loss",
 )  # fmt: skip
-_BY_NAME = {ablation.name: ablation for ablation in ABLATIONS}
-
-
-def find_parent(ablation: Ablation) -> Ablation:
-    """Return the row that a row builds on.
-
-    Raises:
-        KeyError: It changes a variant, not a row.
-    """
-    return _BY_NAME[ablation.parent]
+BY_NAME = {ablation.name: ablation for ablation in ABLATIONS}
 
 
 def list_pose_ablations() -> list[str]:

@@ -4,7 +4,7 @@ them.
 
 from collections.abc import Sequence
 from contextlib import suppress
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -123,7 +123,7 @@ class _Judge:
 
     def __init__(self, data: PoseDataModule) -> None:
         self.data, self.renderer = data, EmbreeRenderer(keep=4)
-        self._known: dict[int, tuple[Mesh, Tensor, Tensor, float]] = {}
+        self._get = cache(self._load)
 
     def score(self, samples: Sequence[Sample], rows: Sequence[PoseRow]) -> TargetErrors:
         """Return the errors of estimates of one class in one image, the most confident first."""
@@ -149,16 +149,14 @@ class _Judge:
         height, width = like.depth.shape
         return render_depth([mesh], [pose.numpy()], K, height, width, self.renderer)[0]
 
-    def _get(self, index: int) -> tuple[Mesh, Tensor, Tensor, float]:
-        if index not in self._known:
-            name = self.data.objects[index]
-            if name not in self.data.meshes.names():
-                raise UserError(f"data.meshes: has no {name}, which VSD renders; name the meshes")
-            mesh, object_model = self.data.meshes.load(name), self.data.object_model(index)
-            points = torch.from_numpy(hull_vertices(mesh.vertices)).double()
-            symmetries = densify(object_model.symmetries.double())
-            self._known[index] = mesh, symmetries, points, float(object_model.diameter)
-        return self._known[index]
+    def _load(self, index: int) -> tuple[Mesh, Tensor, Tensor, float]:
+        name = self.data.objects[index]
+        if name not in self.data.meshes.names():
+            raise UserError(f"data.meshes: has no {name}, which VSD renders; name the meshes")
+        mesh, object_model = self.data.meshes.load(name), self.data.object_model(index)
+        points = torch.from_numpy(hull_vertices(mesh.vertices)).double()
+        symmetries = densify(object_model.symmetries.double())
+        return mesh, symmetries, points, float(object_model.diameter)
 
 
 def _pair(

@@ -2,6 +2,7 @@
 
 import logging
 import warnings
+from typing import Any
 
 import torch
 from lightning import Callback, Trainer
@@ -28,10 +29,8 @@ def build_data(node: DictConfig, console: str) -> PoseDataModule:
     if console == JSON:
         node = without_bars(node)
     if node.get("generate") and "_target_" not in node.generate:
-        node = (
-            node.copy()
-        )  # sizes that debug=smoke has for scenes, with a dataset that renders none
-        node.generate = None
+        node = node.copy()
+        node.generate = None  # sizes that debug=smoke has for scenes: this dataset renders none
     data = instantiate(node, "data")
     if not isinstance(data, PoseDataModule):
         raise UserError(f"data._target_={node.get('_target_')}: is no data module")
@@ -67,23 +66,22 @@ def build_trainer(job: Job) -> Trainer:
             steps,
         )
         cfg.trainer.val_check_interval = steps
-    callbacks: list[Callback] = [
-        made for made in (instantiate(cfg.callbacks, "callbacks") or {}).values() if made
-    ]
+    callbacks: list[Callback] = _build_all(cfg.callbacks, "callbacks")
     for layout in callbacks:
         if isinstance(layout, TensorBoardLayout):
             layout.settings = comparable(job)
-            layout.swept = (
-                tuple(o.split("=", 1)[0].lstrip("+~") for o in job.overrides) if job.swept else ()
-            )
+            typed = job.overrides if job.swept else []
+            layout.swept = tuple(o.split("=", 1)[0].lstrip("+~") for o in typed)
     callbacks.append(progress(cfg.console))
-    loggers: list[Logger] = [
-        made for made in (instantiate(cfg.get("logger"), "logger") or {}).values() if made
-    ]
+    loggers: list[Logger] = _build_all(cfg.get("logger"), "logger")
     for logger in loggers:
         if not isinstance(logger, TensorBoardLogger):  # whose settings TensorBoardLayout logs
             logger.log_hyperparams(comparable(job))
     return make_trainer(cfg.trainer, callbacks, loggers)
+
+
+def _build_all(node: DictConfig, where: str) -> list[Any]:
+    return [made for made in (instantiate(node, where) or {}).values() if made]
 
 
 def make_trainer(

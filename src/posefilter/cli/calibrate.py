@@ -190,8 +190,8 @@ def tell(job: Job, method: PoseEstimator, calibration: Calibration, out: Path) -
         rows.append(("groups of those with it, by rising probability", shown))
     infos = {key: find_metric(f"confidence/{key}") for key in _SHOWN if key in quality}
     rows += [(info.label, info.describe(quality[key])) for key, info in infos.items()]
-    if job.cfg.console != JSON:
-        show_table(f"{method.object_model.name}: held-out parts of the calibration frames", rows)
+    title = f"{method.object_model.name}: held-out parts of the calibration frames"
+    show_table(job.cfg.console, title, rows)
     following = [typed_prediction(out)]
     content = {"object": method.object_model.name, "counts": dict(counts), "quality": dict(quality)}
     ended(job.cfg.console, "calibrated", {"weights": out}, following, **content)

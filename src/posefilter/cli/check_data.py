@@ -1,5 +1,6 @@
 """Tell whether a dataset fits its meshes."""
 
+from collections import Counter
 from pathlib import Path
 from typing import Any
 
@@ -33,30 +34,17 @@ def check_data(job: Job) -> None:
     )
     if cfg.console != JSON:
         print(format_report(report))
-    files = {
-        "report": job.folder / "data_report.json",
-        "pictures": job.folder / "contact_sheet.png",
-    }
-    following = (
-        []
-        if report["problems"]
-        else [
-            train_on(cfg, name, sum(record.object == name for record in reader.records()))
-            for name in (row["object"] for row in report["objects"])
-        ]
-    )
-    ended(
-        cfg.console,
-        "checked",
-        {name: path for name, path in files.items() if path.is_file()},
-        following,
-        **report,
-    )
+    file, pictures = job.folder / "data_report.json", job.folder / "contact_sheet.png"
+    files = {"report": file} | ({"pictures": pictures} if pictures.is_file() else {})
+    following = []
+    if not report["problems"]:
+        images = Counter(record.object for record in reader.records())
+        names = (row["object"] for row in report["objects"])
+        following = [train_on(cfg, name, images[name]) for name in names]
+    ended(cfg.console, "checked", files, following, **report)
     if report["problems"]:
         many = len(report["problems"])
-        raise ProblemsFound(
-            f"{cfg.data.root}: {many} problem{'' if many == 1 else 's'}; see {files['report']}"
-        )
+        raise ProblemsFound(f"{cfg.data.root}: {many} problem{'s' * (many != 1)}; see {file}")
 
 
 def train_on(cfg: DictConfig, name: str, images: int) -> str:

@@ -34,12 +34,8 @@ def recipe(job: Job) -> dict[str, Any]:
     Any other interpolation is resolved here and now, since no reader of the checkpoint would.
     """
     kept = {key: value for key, value in to_plain(job.cfg).items() if key not in NOT_KEPT}
-    return {
-        "choices": {
-            group: choice for group, choice in job.choices.items() if not group.startswith("hydra/")
-        },
-        "settings": resolve_foreign(kept),
-    }
+    choices = {group: c for group, c in job.choices.items() if not group.startswith("hydra/")}
+    return {"choices": choices, "settings": resolve_foreign(kept)}
 
 
 def build_method(
@@ -57,10 +53,9 @@ def build_method(
     assert isinstance(settings, DictConfig)
     _check_references(settings)
     check_fit(settings, recipe["choices"], Scope.RECIPE)
+    variant = _with_lightning if lightning else None
     try:
-        method = instantiate_recipe(
-            settings.get("model"), "model", _with_lightning if lightning else None
-        )
+        method = instantiate_recipe(settings.get("model"), "model", variant)
     except UserError as error:
         where, found, rest = str(error).partition(":")
         key, equals, value = where.partition("=")

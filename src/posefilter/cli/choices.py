@@ -26,7 +26,7 @@ def check_choices(arguments: list[str], conf: Path, command: str | None = None) 
         if own and group != key:
             choice = f"{group}={value}"
             raise UserError(f"{argument}: names a choice; type {rename(choice, command) or choice}")
-        if own and _is_several(group, value):
+        if own and group in SEVERAL and value.startswith("[") and value != "[]":
             check_several(group, value, [conf, *choice_folders(arguments)])
         elif own and value.startswith(("[", "{")):
             options = list_choices(conf / group)
@@ -69,10 +69,6 @@ def check_several(group: str, value: str, folders: Sequence[Path]) -> None:
                 f"{group}={value}: there is no choice '{name}'{hint(name, known).rstrip('?')}; "
                 f"there are {', '.join(known)}"
             )
-
-
-def _is_several(group: str, value: str) -> bool:
-    return group in SEVERAL and value[0] == "[" and value != "[]"
 
 
 def check_variants(arguments: Sequence[str], conf: Path) -> None:

@@ -12,7 +12,7 @@ import hydra
 from hydra import compose, initialize_config_dir
 from hydra.core.global_hydra import GlobalHydra
 from hydra.errors import HydraException
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig, OmegaConf, open_dict
 from omegaconf.errors import OmegaConfBaseException
 
 from posefilter.cli.ablation_configs import register_ablations
@@ -177,9 +177,8 @@ def compose_job(name: str, conf: Path, overrides: list[str], folder: Path) -> Jo
     ):
         cfg = compose(name, [*overrides], return_hydra_config=True)
     choices = {str(k): str(v) for k, v in cfg.hydra.runtime.choices.items()}
-    OmegaConf.set_struct(cfg, False)
-    cfg.pop("hydra")
-    OmegaConf.set_struct(cfg, True)
+    with open_dict(cfg):
+        del cfg["hydra"]
     replace_typed(cfg, overrides)
     return Job(cfg, choices, list(overrides), folder, name, False)
 

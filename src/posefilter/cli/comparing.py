@@ -5,21 +5,12 @@ from typing import Any
 
 from posefilter.cli.job import Job
 from posefilter.cli.plain import to_plain
+from posefilter.report.settings import PASSING
 
 # by whose change nothing else comes out
 HANDS = ("out", "console", "tags", "threads", "data.workers", "data.generate.workers")
 _PLACES = ("data.root", "data.cache_dir")
-_PASSING = (
-    "callbacks",
-    "console",
-    "debug",
-    "folder",
-    "logger",
-    "out",
-    "plugins",
-    "resume",
-    "threads",
-)  # where and how, not what
+_PASSING = (*PASSING, "callbacks", "logger")  # where and how, not what
 
 
 def comparable(job: Job) -> dict[str, bool | int | float | str]:

@@ -42,12 +42,8 @@ def ended(
     if is_follower():
         return
     if console == JSON:
-        told = {
-            **content,
-            "files": {name: str(path) for name, path in files.items()},
-            "next": list(following),
-        }
-        say(console, event, "", **told)
+        paths = {name: str(path) for name, path in files.items()}
+        say(console, event, "", **content, files=paths, next=list(following))
         return
     out = Console(soft_wrap=True, highlight=False)  # paths and commands must survive being copied
     width = max((len(name) for name in files), default=0)
@@ -60,9 +56,9 @@ def ended(
         out.print(Text.assemble("  ", (command, "green")))
 
 
-def show_table(title: str, rows: Sequence[tuple[str, str]]) -> None:
-    """Print a table of names and values."""
-    if is_follower():
+def show_table(console: str, title: str, rows: Sequence[tuple[str, str]]) -> None:
+    """Print a table of names and values; for machines, nothing."""
+    if is_follower() or console == JSON:
         return
     table = Table("", "", title=title, show_header=False, title_justify="left", title_style="bold")
     table.columns[1].justify = "right"
@@ -77,7 +73,7 @@ def typed(command: str, **settings: Any) -> str:
 
     It has the folder of settings and the plug-ins of the command that is running.
     """
-    words = [f"posefilter {command}" if is_installed() else f"python {command}.py"]
+    words = [name_program(command)]
     for folder in config_folders(sys.argv[1:]):
         words += ["--config-dir", shlex.quote(str(folder))]
     plugins = typed_plugins(sys.argv[1:])
@@ -89,6 +85,11 @@ def typed_prediction(checkpoint: Path) -> str:
     """Return a command line that estimates with a checkpoint, with an image of no dataset."""
     image = "rgb=a.png depth=a_depth.png intrinsics=fx,fy,cx,cy depth_scale=10000"
     return f"{typed('predict', checkpoint=checkpoint)} {image}"
+
+
+def name_program(command: str) -> str:
+    """Return a command as it is typed here."""
+    return f"posefilter {command}" if is_installed() else f"python {command}.py"
 
 
 def is_installed() -> bool:

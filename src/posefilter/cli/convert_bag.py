@@ -64,17 +64,10 @@ def convert_bag(job: Job) -> None:
             if cfg.copy_messages:
                 writer.copy(reader.messages())
     if reader.distorted:
-        say(
-            cfg.console,
-            "distorted",
-            "warning: the camera has a lens distortion, and images are taken as rectified ones",
-        )
+        said = "warning: the camera has a lens distortion, and images are taken as rectified ones"
+        say(cfg.console, "distorted", said)
     if blank:
-        say(
-            cfg.console,
-            "blank",
-            f"warning: in {blank} of {images} images no pixel has depth",
-        )
+        say(cfg.console, "blank", f"warning: in {blank} of {images} images no pixel has depth")
     if cfg.console != JSON:
         early = f", {reader.early} before the first camera_info" if reader.early else ""
         print(f"{images} images, {reader.unpaired} without depth{early}")

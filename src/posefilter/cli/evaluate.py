@@ -3,6 +3,7 @@
 import shutil
 from collections import Counter
 from collections.abc import Mapping
+from dataclasses import replace
 from math import inf, nan
 from pathlib import Path
 from typing import Any
@@ -73,19 +74,10 @@ def evaluate(job: Job) -> float:
     mismatch = describe_mismatch(size, metrics["data"]["root"])
     if mismatch:
         say(job.cfg.console, "warning", f"warning: {mismatch}", **size)
-    following = (
-        [typed("report", run=job.folder)]
-        if (job.folder / ".hydra").is_dir() and not job.swept
-        else []
-    )
-    show(
-        metrics,
-        str(job.cfg.estimates or job.cfg.checkpoint),
-        job.cfg.console,
-        "evaluated",
-        files,
-        following,
-    )
+    reported = (job.folder / ".hydra").is_dir() and not job.swept
+    following = [typed("report", run=job.folder)] if reported else []
+    tested = str(job.cfg.estimates or job.cfg.checkpoint)
+    show(metrics, tested, job.cfg.console, "evaluated", files, following)
     return compute_checkpoint_score(metrics)
 
 
@@ -104,10 +96,8 @@ def _of_checkpoint(job: Job) -> tuple[dict[str, Any], dict[str, Path]]:
     if method.calibration is not None:
         method.calibration.fit_success(method.pose_tolerance)  # refused before anything is tested
     check_links(job.folder)
-    data = build_data(
-        data_settings(job, checkpoint["recipe"]["settings"], method.object_model.name),
-        job.cfg.console,
-    )
+    settings = data_settings(job, checkpoint["recipe"]["settings"], method.object_model.name)
+    data = build_data(settings, job.cfg.console)
     data.setup("test")
     method.set_object(object_to_judge(data, method.object_model))
     warn_of_several(data, job.cfg.console)
@@ -121,17 +111,9 @@ def _of_checkpoint(job: Job) -> tuple[dict[str, Any], dict[str, Path]]:
         files["poses"] = job.folder / "poses.csv"
         write_poses_csv(files["poses"], to_rows(records.outcomes, data.records("test"), native))
     write_beliefs(files["beliefs"], records.outcomes, data.records("test"), native)
-    tested = Job(
-        job.cfg,
-        {**checkpoint["recipe"]["choices"], **chosen(job)},
-        job.overrides,
-        job.folder,
-        job.name,
-        job.swept,
-    )
-    return record(
-        method.compute_metrics(), tested, data.describe(), Path(job.cfg.checkpoint)
-    ), files
+    tested = replace(job, choices={**checkpoint["recipe"]["choices"], **chosen(job)})
+    found = record(method.compute_metrics(), tested, data.describe(), Path(job.cfg.checkpoint))
+    return found, files
 
 
 def warn_of_several(data: PoseDataModule, console: str) -> None:
@@ -186,63 +168,50 @@ def _of_estimates(job: Job) -> tuple[dict[str, Any], dict[str, Path]]:
     for row in sorted(rows, key=lambda row: row.score):
         best[row.scene_id, row.im_id, row.obj_id] = row
     assigned = assign_estimates(rows, data.records("test"), data)
+    if not assigned:
+        raise UserError(
+            f"estimates={job.cfg.estimates}: none of its {len(rows)} rows belongs to "
+            f"an instance of this data"
+        )
     models = [data.object_model(i) for i in range(len(data.objects))]
     errors, bop, iou = PoseErrors(models), BopErrors(models), BoxIoU()
     in_mesh_frame = list[float]()  # ADD [m], were they of the meshes' frames
-    used, table = 0, list[ImageError]()
+    table = list[ImageError]()
     for batch in data.test_dataloader():
         own = [data.records("test")[i] for i in batch.frame_id.tolist()]
         estimates = [assigned.get(r.key) for r in own]
         poses = torch.full_like(batch.camera_from_object, torch.nan)
         for i, estimate in enumerate(estimates):
-            if estimate is not None:
-                used += 1
-                native = data.reader.native_from_mesh(own[i].object)
-                pose = to_mesh(estimate.camera_from_native, native)
-                poses[i] = torch.from_numpy(pose.astype(np.float32))
-                as_it_is = torch.from_numpy(estimate.camera_from_native)[None]
-                truth = batch.camera_from_object[i : i + 1].double()
-                points = models[int(batch.object_id[i])].points.double()
-                in_mesh_frame += add(as_it_is, truth, points).tolist()
-            else:
+            if estimate is None:
                 in_mesh_frame.append(inf)
+                continue
+            native = data.reader.native_from_mesh(own[i].object)
+            pose = to_mesh(estimate.camera_from_native, native)
+            poses[i] = torch.from_numpy(pose.astype(np.float32))
+            as_it_is = torch.from_numpy(estimate.camera_from_native)[None]
+            truth = batch.camera_from_object[i : i + 1].double()
+            points = models[int(batch.object_id[i])].points.double()
+            in_mesh_frame += add(as_it_is, truth, points).tolist()
         errors.update(poses, batch.camera_from_object, batch.object_id)
         height, width = batch.rgb.shape[-2:]
         bop.update(poses, batch.camera_from_object, batch.intrinsics, width, batch.object_id)
-        pairs = [
-            (nan, nan) if row is None else (row.score, row.seconds if row.seconds >= 0 else nan)
-            for row in estimates
-        ]
-        scores, times = zip(*pairs, strict=True)
-        own_errors = [
-            (1000 * state[-1]).tolist() for state in (errors.add, errors.add_s, errors.diameter)
-        ]
+        scores = [nan if row is None else row.score for row in estimates]
+        times = [nan if row is None or row.seconds < 0 else row.seconds for row in estimates]
+        own_errors = (1000 * errors.rows[-1]).T.tolist()
         table += make_rows(own, batch, own_errors, [nan] * len(own), scores, times)
         for i, index in enumerate(batch.object_id.tolist()):
             hull, K = errors.models[index].hull, batch.intrinsics[i : i + 1]
             truth = box_of_pose(batch.camera_from_object[i : i + 1], hull, K, height, width)
             guess = box_of_pose(poses[i : i + 1], hull, K, height, width).nan_to_num(0.0)
             iou.update(guess, truth)
-    if not used:
-        raise UserError(
-            f"estimates={job.cfg.estimates}: none of its {len(rows)} rows belongs to "
-            f"an instance of this data"
-        )
     found = errors.compute()
-    warn_of_frame(
-        found["add"]["median_mm"], 1000 * float(np.median(in_mesh_frame)), job.cfg.console
-    )
-    results = {
-        **found,
-        **bop.compute(),
-        "iou": float(iou.compute()),
-        "particles_on_object": None,
-    }
+    other = 1000 * float(np.median(in_mesh_frame))
+    warn_of_frame(found["add"]["median_mm"], other, job.cfg.console)
     seconds = [row.seconds for row in best.values() if row.seconds >= 0]
-    results |= {
-        "seconds_per_image": sum(seconds) / len(seconds) if seconds else None,
-        "belief": None,
-    }
+    results = found | bop.compute()
+    results |= {"iou": float(iou.compute()), "particles_on_object": None}
+    results["seconds_per_image"] = sum(seconds) / len(seconds) if seconds else None
+    results["belief"] = None
     if job.cfg.targets is not None:
         results["bop"] = score_targets(rows, str(job.cfg.targets), data.records("test"), data)
     write_errors(job.folder / ERRORS, table)
@@ -287,9 +256,7 @@ def data_settings(
             "data: exported weights carry no dataset; give "
             "data=fat|ycb_video|bop|scenes and data.root=DIR"
         )
-    settings = (
-        dict(said) if chosen else changed({"data": own}, {"data": said} if said else {})["data"]
-    )
+    settings = dict(said) if chosen else changed({"data": own}, {"data": said})["data"]
     if "split" in typed:  # typed whole, it replaces the checkpoint's
         settings["split"] = said["split"]
     settings["augment"] = {}
@@ -373,9 +340,8 @@ def check_bop_model(data: PoseDataModule, own: ObjectModel) -> None:
         return
     roots = [Path(str(data.root)), Path(str(data.root)).parent]
     folders = [Path(str(data.meshes.root)), *(root / "models" for root in roots)]
-    file = next(
-        (f / "models_info.json" for f in folders if (f / "models_info.json").is_file()), None
-    )
+    files = (folder / "models_info.json" for folder in folders)
+    file = next((one for one in files if one.is_file()), None)
     if file is None:
         return
     number = ycbvideo_index(own.name)

@@ -6,7 +6,9 @@ Torch is not imported for it: components of posefilter are read from their sourc
 
 import ast
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
 from functools import cache
 from importlib.util import find_spec
 from itertools import permutations
@@ -68,7 +70,7 @@ def check_fit(settings: DictConfig, choices: Mapping[str, str], scope: Scope) ->
         tops = {key.partition(".")[0] for key in keys}
         near = {g: name for g, name in choices.items() if g.partition("/")[0] in tops}
         with open_groups() as groups:
-            told = _explain(components[number], need, components, keys, near, scope, groups)
+            told = Advice(groups, near, components, scope).explain(components[number], need, keys)
         raise UserError(told)
     if broken is not None:
         raise broken
@@ -133,13 +135,10 @@ def read_attribute(module: str, name: str, attribute: str) -> tuple[str, ...] | 
     if not isinstance(kind, ast.ClassDef):
         return None
     for line in kind.body:
-        if (
-            isinstance(line, ast.AnnAssign)
-            and isinstance(line.target, ast.Name)
-            and line.target.id == attribute
-            and line.value is not None
-        ):
-            return tuple(ast.literal_eval(line.value))
+        match line:
+            case ast.AnnAssign(target=ast.Name(id=own), value=ast.expr() as value):
+                if own == attribute:
+                    return tuple(ast.literal_eval(value))
     for base in kind.bases:
         found = read_attribute(module, base.id, attribute) if isinstance(base, ast.Name) else None
         if found is not None:
@@ -182,159 +181,125 @@ def typed_key(tree: Any, where: str) -> str:
     return ".".join(path)
 
 
-def list_fitting(
-    group: str,
-    groups: Groups,
-    components: Sequence[Component],
-    scope: Scope,
-    need: str | None = None,
-) -> list[str]:
-    """Return the choices of a group that find all they require elsewhere, and take nothing away.
+def _name_missing(declared: Iterable[Declared]) -> set[str]:
+    return {name for _, name in find_missing(declared)}
+
+
+@dataclass(frozen=True)
+class Advice:
+    """What could be chosen instead of a component that does not fit.
 
     Args:
-        group: The group.
-        groups: Where its choices are read.
+        groups: Where choices are read.
+        choices: Which file of each group was chosen; another may have been since.
         components: All that is chosen.
         scope: Where the settings come from.
-        need: What the choice must provide as well; null for nothing.
     """
-    options = groups.list_options(group)
-    others = _list_others([group], groups, components)
-    provided = _union(declared.provides for declared in others)
-    required = _union(declared.requires for declared in others)
-    found = {name for _, name in find_missing(component.declared for component in components)}
-    fitting = []
-    for option in options:
-        own = _declared_by_option(option, scope)
-        if own is None:
-            continue
-        offered = _union(declared.provides for declared in own)
-        fits = _union(declared.requires for declared in own) <= provided | offered
-        breaks = required - provided - offered - found
-        if fits and not breaks and (need is None or need in offered):
-            fitting.append(option.name)
-    return fitting
 
+    groups: Groups
+    choices: Mapping[str, str]
+    components: Sequence[Component]
+    scope: Scope
 
-def list_pairs(
-    names: Sequence[str],
-    groups: Groups,
-    components: Sequence[Component],
-    scope: Scope,
-    need: str,
-) -> list[str]:
-    """Return the choices that provide what is needed where another group's choice changes too, as
-    they are typed.
+    def explain(self, component: Component, need: str, keys: set[str]) -> str:
+        """Return the line that names the component that does not fit, what it needs, and what fits.
 
-    Args:
-        names: The groups to choose from.
-        groups: Where their choices are read.
-        components: All that is chosen.
-        scope: Where the settings come from.
-        need: What the first choice must provide.
-    """
-    found = {name for _, name in find_missing(component.declared for component in components)}
-    pairs = []
-    for first, second in permutations(names, 2):
-        others = _list_others([first, second], groups, components)
-        for one in groups.list_options(first):
-            own = _declared_by_option(one, scope) or []
-            if need not in _union(declared.provides for declared in own):
-                continue
-            for two in groups.list_options(second):
-                with_it = _declared_by_option(two, scope)
-                if with_it is None:
-                    continue
-                left = {name for _, name in find_missing([*others, *own, *with_it])}
-                if left <= found - {need}:
-                    pairs.append(f"{first}={one.name} with {second}={two.name}")
-    return pairs
+        Args:
+            component: It does not fit.
+            need: What it needs.
+            keys: Places of all settings of the model, as one types them.
+        """
+        group, name = self.find_choice(component) or (component.key, component.target)
+        advice, others = list[str](), list[str]()
+        if group in self.choices and group != "model":
+            fitting = self.list_fitting(group)
+            advice += [f"{group}={_either(fitting)}"] if fitting else []
+        for option in self.list_chosen():
+            if option.group not in ("model", group) and keys & {
+                place for place, _ in list_places(option.settings, "")
+            }:
+                fitting = self.list_fitting(option.group, need)
+                advice += [f"{option.group}={_either(fitting)}"] if fitting else []
+                others.append(option.group)
+        if not any(one.partition("=")[0] in others for one in advice):
+            advice += self.list_pairs(others, need)
+        kinds = [one.target.rpartition(".")[2] for one in self.components if one.key == "model"]
+        chosen = self.choices.get("model") or "".join(kinds)
+        model = "" if group == "model" else f" does not fit model={chosen}, as it"
+        choose = f"; choose {', or '.join(advice)}" if advice else ""
+        return f"{group}={name}{model} needs {MEANINGS.get(need, need)} ({need}){choose}"
 
+    def list_chosen(self) -> list[Option]:
+        """Return the choices that were made."""
+        return [self.groups.load(*choice) for choice in self.choices.items()]
 
-def _declared_by_option(option: Option, scope: Scope) -> list[Declared] | None:
-    """Return what the classes of a choice declare; None for a draft, which cannot be chosen."""
-    try:
-        return [declared_by(target, key, scope) for key, target in option.targets().items()]
-    except UserError:
+    def find_choice(self, component: Component) -> tuple[str, str] | None:
+        """Return the (group, name) of the choice that puts a class at its place; None where there
+        is none.
+        """
+        others = []
+        for option in self.list_chosen():
+            named = option.targets()
+            if named.get(component.key) == component.target:
+                return option.group, option.name
+            if component.key in named:
+                others.append(option.group)
+        for group in others:
+            for option in self.groups.list_options(group):
+                if option.targets().get(component.key) == component.target:
+                    return group, option.name
         return None
 
+    def list_fitting(self, group: str, need: str | None = None) -> list[str]:
+        """Return the choices of a group that find all they require elsewhere, and take nothing
+        away; with a need, those that provide it as well.
+        """
+        others, found = self._list_others(group), _name_missing(c.declared for c in self.components)
+        fitting = []
+        for name, own in self._list_declared(group):
+            own_needs = frozenset().union(*(declared.requires for declared in own))
+            fits = _name_missing([*others, *own]) <= found - own_needs
+            if fits and (need is None or _provide(own, need)):
+                fitting.append(name)
+        return fitting
 
-def _list_others(
-    names: Sequence[str], groups: Groups, components: Sequence[Component]
-) -> list[Declared]:
-    """Return what those components declare that no choice of these groups replaces."""
-    options = [option for name in names for option in groups.list_options(name)]
-    places = {place for option in options for place in option.targets()}
-    return [p.declared for p in components if not any(_within(p.key, place) for place in places)]
+    def list_pairs(self, names: Sequence[str], need: str) -> list[str]:
+        """Return the choices of groups that provide what is needed where another group's choice
+        changes too, as they are typed.
+        """
+        left = _name_missing(c.declared for c in self.components) - {need}
+        return [
+            f"{first}={one} with {second}={two}"
+            for first, second in permutations(names, 2)
+            for one, own in self._list_declared(first)
+            if _provide(own, need)
+            for two, more in self._list_declared(second)
+            if _name_missing([*self._list_others(first, second), *own, *more]) <= left
+        ]
+
+    def _list_declared(self, group: str) -> Iterator[tuple[str, list[Declared]]]:
+        """Yield a group's choices with what their classes declare, but for drafts, which cannot be
+        chosen.
+        """
+        for option in self.groups.list_options(group):
+            with suppress(UserError):
+                targets = option.targets().items()
+                yield option.name, [declared_by(name, key, self.scope) for key, name in targets]
+
+    def _list_others(self, *groups: str) -> list[Declared]:
+        """Return what those components declare that no choice of these groups replaces."""
+        options = [option for group in groups for option in self.groups.list_options(group)]
+        places = {place for option in options for place in option.targets()}
+        return [
+            one.declared
+            for one in self.components
+            if not any(f"{one.key}.".startswith((f"{p}.", f"{p}[")) for p in places)
+        ]
 
 
-def find_choice(
-    key: str, target: str, choices: Mapping[str, str], groups: Groups
-) -> tuple[str, str] | None:
-    """Return the (group, name) of the choice that puts a class at a place; None where there is
-    none.
-
-    Args:
-        key: The place, such as `loss` or `filter.resample`.
-        target: The class's dotted name.
-        choices: Which file of each group was chosen; another may have been since.
-        groups: Where choices are read.
-    """
-    others = []
-    for option in (groups.load(group, name) for group, name in choices.items()):
-        named = option.targets()
-        if named.get(key) == target:
-            return option.group, option.name
-        if key in named:
-            others.append(option.group)
-    for group in others:
-        for option in groups.list_options(group):
-            if option.targets().get(key) == target:
-                return group, option.name
-    return None
-
-
-def _explain(
-    component: Component,
-    need: str,
-    components: Sequence[Component],
-    keys: set[str],
-    choices: Mapping[str, str],
-    scope: Scope,
-    groups: Groups,
-) -> str:
-    """Return the line that names the component that does not fit, what it needs, and what fits."""
-    group, name = find_choice(component.key, component.target, choices, groups) or (
-        component.key,
-        component.target,
-    )
-    advice, others = list[str](), list[str]()
-    if group in choices and group != "model":
-        fitting = list_fitting(group, groups, components, scope)
-        advice += [f"{group}={_either(fitting)}"] if fitting else []
-    for option in (groups.load(*choice) for choice in choices.items()):
-        if option.group not in ("model", group) and keys & {
-            place for place, _ in list_places(option.settings, "")
-        }:
-            fitting = list_fitting(option.group, groups, components, scope, need)
-            advice += [f"{option.group}={_either(fitting)}"] if fitting else []
-            others.append(option.group)
-    if not any(one.partition("=")[0] in others for one in advice):
-        advice += list_pairs(others, groups, components, scope, need)
-    kinds = [part.target.rpartition(".")[2] for part in components if part.key == "model"]
-    chosen = choices.get("model") or "".join(kinds)
-    model = "" if group == "model" else f" does not fit model={chosen}, as it"
-    choose = f"; choose {', or '.join(advice)}" if advice else ""
-    return f"{group}={name}{model} needs {MEANINGS.get(need, need)} ({need}){choose}"
+def _provide(declared: Iterable[Declared], need: str) -> bool:
+    return any(need in one.provides for one in declared)
 
 
 def _either(names: Sequence[str]) -> str:
     return " or ".join(([", ".join(names[:-1])] if names[1:] else []) + [names[-1]])
-
-
-def _within(key: str, place: str) -> bool:
-    return key == place or key.startswith((f"{place}.", f"{place}["))
-
-
-def _union(sets: Iterable[frozenset[str]]) -> frozenset[str]:
-    return frozenset().union(*sets)

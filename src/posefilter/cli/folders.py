@@ -52,13 +52,11 @@ class KeepResults(Callback):
         elif holds_run(folder) and not config.get("resume") and not is_follower():
             refuse(folder, f"a run already; choose another folder, or resume it: resume={folder}")
         elif config.hydra.job.name == "train" and not config.get("resume") and not is_follower():
-            self._check_within(folder)
+            others = sorted(folder.glob("*/.hydra/config.yaml"))
+            if others:
+                name = others[0].parents[1].name
+                refuse(folder, f"other runs, such as {name}; choose a folder of its own")
         hold_folder(folder)
-
-    def _check_within(self, folder: Path) -> None:
-        other = find_run_within(folder)
-        if other is not None:
-            refuse(folder, f"other runs, such as {other.name}; choose a folder of its own")
 
 
 @contextmanager
@@ -90,12 +88,6 @@ def hold_folder(folder: Path) -> None:
 def holds_run(folder: Path) -> bool:
     """Tell whether a training has been there."""
     return (folder / "metrics.json").is_file() or (folder / "checkpoints").is_dir()
-
-
-def find_run_within(folder: Path) -> Path | None:
-    """Return a run that has a folder of its own inside another; None where there is none."""
-    found = folder.glob("*/.hydra/config.yaml")
-    return min((path.parents[1] for path in found), default=None)
 
 
 def holds_evaluation(folder: Path) -> bool:

@@ -27,20 +27,14 @@ def generate(job: Job) -> None:
             f"{summary.frames} frames in {summary.folders} folders, {summary.rendered} of them "
             f"rendered now{speed}"
         )
-    scale = {} if job.cfg.mesh_scale is None else {"mesh_scale": job.cfg.mesh_scale}
-    following = typed(
-        "check_data",
-        data="fat",
-        data__root=summary.out,
-        data__object=job.cfg.object,
-        meshes=job.cfg.meshes,
-        **scale,
-    )
+    made = {"data__root": summary.out, "data__object": job.cfg.object, "meshes": job.cfg.meshes}
+    made |= {} if job.cfg.mesh_scale is None else {"mesh_scale": job.cfg.mesh_scale}
+    files = {"data": summary.out} | ({"preview": preview} if preview else {})
     ended(
         job.cfg.console,
         "generated",
-        {"data": summary.out, **({"preview": preview} if preview else {})},
-        [following],
+        files,
+        [typed("check_data", data="fat", **made)],
         frames=summary.frames,
         rendered=summary.rendered,
         frames_per_second=summary.frames_per_second,

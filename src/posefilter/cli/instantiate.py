@@ -23,19 +23,8 @@ from posefilter.cli.trust import (
     is_listed,
     is_plugin,
     listed_in,
-    trust,
 )
 from posefilter.errors import UserError, find_reason
-
-__all__ = [
-    "accepted",
-    "check_arguments",
-    "hint",
-    "instantiate",
-    "instantiate_recipe",
-    "locate",
-    "trust",
-]
 
 Variant = Callable[[Any], Callable[..., Any]]
 _LIBRARIES = ("torch.", "lightning.")
@@ -116,9 +105,9 @@ def locate(name: str, where: str, scope: Scope = Scope.CONFIG) -> Callable[..., 
     Raises UserError where it may not, or cannot, be imported. Nothing is imported for a name that
     is not allowed.
     """
-    new = rename_class(name)
+    said, new = f"{where}._target_={name}", rename_class(name)
     if new is not None:
-        raise UserError(f"{where}._target_={name}: is now {new}")
+        raise UserError(f"{said}: is now {new}")
     check_name(name, where, scope)
     module, _, attribute = name.rpartition(".")
     listed, plugin = is_listed(name, scope), is_plugin(name)
@@ -128,38 +117,32 @@ def locate(name: str, where: str, scope: Scope = Scope.CONFIG) -> Callable[..., 
         home = importlib.import_module(module)
     except ModuleNotFoundError as error:
         if error.name and not f"{module}.".startswith(f"{error.name}."):
-            raise UserError(
-                f"{where}._target_={name}: needs the package '{error.name}', which is not installed"
-            ) from error
-        near = hint(error.name or module, _list_modules(error.name or module))
-        raise UserError(
-            f"{where}._target_={name}: there is no module {error.name or module}{near}{old}"
-        ) from error
+            needed = f"needs the package '{error.name}', which is not installed"
+            raise UserError(f"{said}: {needed}") from error
+        absent = error.name or module
+        near = hint(absent, _list_modules(absent))
+        raise UserError(f"{said}: there is no module {absent}{near}{old}") from error
     except (Exception, SystemExit) as error:
         if not plugin:
             raise
-        raise UserError(
-            f"{where}._target_={name}: {module} could not be imported ({type(error).__name__}: "
-            f"{find_reason(error)})"
-        ) from error
+        reason = f"{type(error).__name__}: {find_reason(error)}"
+        raise UserError(f"{said}: {module} could not be imported ({reason})") from error
     own = plugin or is_component(module, scope)
     found = vars(home).get(attribute)
     if found is None or not (listed or (own and _defined_in(found, module, attribute))):
         known = listed_in(module, scope)
         if found is not None and not own:
             raise UserError(
-                f"{where}._target_={name}: is not on the list of what may be built of {module} "
+                f"{said}: is not on the list of what may be built of {module} "
                 f"({', '.join(known)}); a function of a plug-in of yours may return one"
             )
         known += [
             key for key, value in vars(home).items() if own and _defined_in(value, module, key)
         ]
-        raise UserError(
-            f"{where}._target_={name}: there is no '{attribute}' defined in "
-            f"{module}{hint(attribute, known)}{old}"
-        )
+        near = hint(attribute, known)
+        raise UserError(f"{said}: there is no '{attribute}' defined in {module}{near}{old}")
     if not (listed or inspect.isclass(found) or (plugin and inspect.isfunction(found))):
-        raise UserError(f"{where}._target_={name}: is no class")
+        raise UserError(f"{said}: is no class")
     return typing.cast(Callable[..., Any], found)
 
 
@@ -190,14 +173,9 @@ def accepted(target: Callable[..., Any]) -> tuple[dict[str, inspect.Parameter], 
     A class that hands `**base` on to its parent takes the parent's parameters.
     """
     known: dict[str, inspect.Parameter] = {}
-    calls: list[Callable[..., Any]] = [target]
-    if inspect.isclass(target):
-        calls = [vars(kind)["__init__"] for kind in target.__mro__ if "__init__" in vars(kind)] or [
-            target
-        ]
-        if "__init__" not in {name for kind in target.__mro__[:-1] for name in vars(kind)}:
-            calls = [target]
-    for call in calls:
+    kinds = target.__mro__[:-1] if inspect.isclass(target) else ()  # less `object`
+    calls = [vars(kind)["__init__"] for kind in kinds if "__init__" in vars(kind)]
+    for call in calls or [target]:
         parameters = inspect.signature(call).parameters.values()
         for parameter in parameters:
             if (

@@ -82,11 +82,9 @@ def run_of(path: Any) -> str:
     file = Path(str(path))
     if file.is_dir():
         return str(file)
-    return (
-        str(file.parent.parent)
-        if file.parent.name == "checkpoints"
-        else f"outputs/evaluations/{file.stem}"
-    )
+    if file.parent.name == "checkpoints":
+        return str(file.parent.parent)
+    return f"outputs/evaluations/{file.stem}"
 
 
 def check_out(cfg: DictConfig) -> None:

@@ -3,10 +3,11 @@
 import shutil
 import time
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
-from lightning import Callback, LightningModule, Trainer
+from lightning.pytorch.callbacks import LambdaCallback
 
 from posefilter.cli.job import Job
 from posefilter.cli.train import build, look_once
@@ -22,17 +23,6 @@ class Speed(NamedTuple):
     image: float  # of the filter, the median of some [s]
 
 
-class _Clock(Callback):
-    """Take the time at the end of each step."""
-
-    def __init__(self) -> None:
-        self.times: list[float] = []
-
-    def on_train_batch_end(self, trainer: Trainer, pl_module: LightningModule, *_: Any) -> None:
-        """Take it."""
-        self.times.append(time.perf_counter())
-
-
 def measure_speed(job: Job) -> Speed:
     """Measure a training by some steps that are thrown away, with all that it wrote.
 
@@ -46,15 +36,17 @@ def measure_speed(job: Job) -> Speed:
     enough = (_STEPS + 1) * cfg.data.batch_size  # frames that are decoded for it
     cfg.data.limit_train = min(enough, cfg.data.limit_train or enough)
     cfg.data.limit_val = 1
-    trial = Job(cfg, job.choices, job.overrides, job.folder, job.name, False)
+    trial = replace(job, cfg=cfg, swept=False)
+    times = list[float]()
+    clock = LambdaCallback(on_train_batch_end=lambda *_: times.append(time.perf_counter()))
     try:
-        run, clock = build(trial), _Clock()
+        run = build(trial)
         images = [_time(lambda: look_once(run.method, run.data)) for _ in range(_IMAGES)]
         run.trainer.callbacks.append(clock)  # type: ignore[attr-defined]
         run.trainer.fit(run.method, datamodule=run.data)
     finally:
         shutil.rmtree(job.folder, ignore_errors=True)
-    steps = np.diff(clock.times)[_SKIPPED - 1 :]
+    steps = np.diff(times)[_SKIPPED - 1 :]
     return Speed(float(steps.min()), float(np.median(images)))
 
 

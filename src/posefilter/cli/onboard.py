@@ -4,7 +4,7 @@ on.
 
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from hashlib import sha256
 from pathlib import Path
@@ -117,7 +117,7 @@ class Onboarding:
         own = str(self.cfg.symmetries)
         own = "found" if own == "auto" else own  # as records of earlier versions have it
         if Path(own).is_file():
-            own = Path(own).read_text()
+            own = Path(own).read_text(encoding="utf-8")
         return {
             "mesh": self.mesh_digest,
             "symmetries": sha256(own.encode()).hexdigest()[:16],
@@ -160,8 +160,7 @@ class Onboarding:
         elif start is not None:
             words.append(f"warm_start='{start}'")
         words += [*map(str, self.cfg.train_overrides), *more]
-        composed = compose_job("train", find_conf(), words, folder)
-        return Job(composed.cfg, composed.choices, words, folder, "train", True)
+        return replace(compose_job("train", find_conf(), words, folder), swept=True)
 
     @cached_property
     def run(self) -> Any:
@@ -343,15 +342,10 @@ def evaluate(work: Onboarding) -> None:
 
 def report(work: Onboarding) -> None:
     """Write the page."""
-    record = read_run(work.training)
-    page = make_onboarding_page(
-        record,
-        compared(record),
-        typed("onboard", mesh=work.cfg.mesh, out=work.out),
-        work.stages.values,
-        work.stages.seconds,
-        work.out / "symmetries.png",
-    )
+    record, stages = read_run(work.training), work.stages
+    command = typed("onboard", mesh=work.cfg.mesh, out=work.out)
+    found = (stages.values, stages.seconds, work.out / "symmetries.png")
+    page = make_onboarding_page(record, compared(record), command, *found)
     folder = work.out / "report"
     write_whole(folder / "report.html", page.render())
     for name, png in page.files().items():
@@ -371,14 +365,8 @@ def tell(work: Onboarding) -> None:
     shown = ", ".join(f"{name} {m:.1f}" for name, m in minutes.items())
     say(work.cfg.console, "minutes", f"minutes: {shown}", minutes=minutes)
     scores = {key: metrics[key] for key in ("add", "add_s", "mssd", "mspd")}
-    ended(
-        work.cfg.console,
-        "onboarded",
-        files,
-        [typed_prediction(work.weights)],
-        object=work.mesh.name,
-        **scores,
-    )
+    following = [typed_prediction(work.weights)]
+    ended(work.cfg.console, "onboarded", files, following, object=work.mesh.name, **scores)
 
 
 def _split(frames: int) -> str:

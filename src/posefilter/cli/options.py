@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
+from functools import cache
 from typing import Any, NamedTuple
 
 from hydra import initialize_config_dir
@@ -58,13 +59,8 @@ class Groups:
     """
 
     def __init__(self, loader: Any) -> None:
-        self._loader, self._read = loader, dict[tuple[str, str], Option]()
-
-    def load(self, group: str, name: str) -> Option:
-        """Read one choice, with the files of its own group that it starts from."""
-        if (group, name) not in self._read:
-            self._read[group, name] = self._load(group, name)
-        return self._read[group, name]
+        self._loader = loader
+        self.load = cache(self._load)
 
     def list_options(self, group: str) -> list[Option]:
         """Read all choices of a group."""
@@ -77,6 +73,7 @@ class Groups:
         return options
 
     def _load(self, group: str, name: str) -> Option:
+        """Read one choice, with the files of its own group that it starts from."""
         folder, _, package = str(group).partition("@")
         found = self._loader.repository.load_config(f"{folder}/{name}")
         if found is None:

@@ -30,7 +30,7 @@ from posefilter.figures.view_data import collect_view_data
 from posefilter.images import check_images
 from posefilter.meshes.ycb import number_objects
 from posefilter.metrics.bop_results import PoseRow, choose_score, write_poses_csv
-from posefilter.result import Result, Run, collect_results
+from posefilter.result import Result, collect_results
 from posefilter.weights import expand_weights, is_several
 
 VIEW = "view.rrd"
@@ -89,25 +89,16 @@ def predict_one(job: Job) -> list[Result]:
     answer = describe(result, method.filter.score_is, cfg.checkpoint, belief_file, job)
     write_json(folder / "pose.json", answer)
     if cfg.save_rerun:
-        record_view(run, shape, folder / VIEW)
+        model, space = method.object_model, method.space
+        record(collect_view_data(run.trace, run.batch, model, space, shape), folder / VIEW)
     if cfg.console != JSON:
         print_result(result)
-    files = {
-        "pose": "pose.json",
-        "overlay": "overlay.png",
-        "belief": "belief.png",
-        "numbers": "belief.npz",
-    }
-    files |= {"band": "band.png"} if band.is_file() else {}
-    files |= {"view": VIEW} if cfg.save_rerun else {}
+    files = {"pose": folder / "pose.json", "overlay": folder / "overlay.png"}
+    files |= {"belief": folder / "belief.png", "numbers": belief_file}
+    files |= {"band": band} if band.is_file() else {}
+    files |= {"view": folder / VIEW} if cfg.save_rerun else {}
     following = [f"rerun {shlex.quote(str(folder / VIEW))}"] if cfg.save_rerun else []
-    ended(
-        cfg.console,
-        "predicted",
-        {name: folder / file for name, file in files.items()},
-        following,
-        **answer,
-    )
+    ended(cfg.console, "predicted", files, following, **answer)
     return [result]
 
 
@@ -149,9 +140,9 @@ def predict_several(job: Job) -> list[Result]:
     answers += [describe_absent(one, scores[one], costs, own[one], job) for one in missing]
     write_json(folder / "poses.json", answers)
     write_poses_csv(folder / "poses.csv", list_rows(seen, estimator.objects))
-    files = {name: folder / name for name in ("poses.json", "poses.csv", "overlay.png", "beliefs")}
-    paths = {name.removesuffix(".json").replace(".png", ""): file for name, file in files.items()}
-    ended(cfg.console, "predicted", paths, [], poses=answers)
+    files = {"poses": folder / "poses.json", "poses.csv": folder / "poses.csv"}
+    files |= {"overlay": folder / "overlay.png", "beliefs": beliefs}
+    ended(cfg.console, "predicted", files, [], poses=answers)
     return results
 
 
@@ -166,12 +157,6 @@ def list_rows(results: Sequence[Result], objects: Sequence[str]) -> list[PoseRow
         score = choose_score(one.probability, one.score)
         rows.append(PoseRow(0, 0, number, score, one.pose, seconds))
     return rows
-
-
-def record_view(run: Run, shape: Any, path: Path) -> None:
-    """Write the interactive 3-D view."""
-    method = run.method
-    record(collect_view_data(run.trace, run.batch, method.object_model, method.space, shape), path)
 
 
 def read_costs(cfg: DictConfig) -> Costs:
@@ -198,15 +183,13 @@ def print_result(result: Result) -> None:
     if result.verdict is None:
         print(f"{result.object} at {place} mm, {result.seconds:.2f} s")
         print(f"no probability: {result.calibration_note}")
-    elif result.verdict == "absent":
-        print(f"{result.describe()}, {result.seconds:.2f} s")
     else:
-        print(f"{result.describe()}, at {place} mm, {result.seconds:.2f} s")
+        at = "" if result.verdict == "absent" else f", at {place} mm"
+        print(f"{result.describe()}{at}, {result.seconds:.2f} s")
     if is_found_by_surface(result):
         said = f"probability {result.probability_within(_SURFACE):.2f} {_SURFACE.describe()}"
-        print(
-            f"{said}: its place is surer than its rotation (pose_tolerance.add_s={_SURFACE.add_s})"
-        )
+        how = f"pose_tolerance.add_s={_SURFACE.add_s}"
+        print(f"{said}: its place is surer than its rotation ({how})")
     if result.verdict != "absent":
         print(f"the belief: {result.belief.uncertainty().describe()}")
     for warning in result.warnings:
@@ -344,16 +327,15 @@ def read_photograph(rgb: str, depth: str, depth_scale: float) -> tuple[np.ndarra
         raise UserError(f"depth={depth}: no pixel has depth")
     median = float(np.median(z[z > 0]))
     if not 0.05 <= median <= 30:
-        cause = (
-            f"depth_scale={depth_scale}: the median depth would be {median:.3g} m; is it 1000 or "
-            "10000?"
-        )
         if holds_meters(Path(depth)):
-            cause = (
+            raise UserError(
                 f"depth={depth}: its floats should be meters, which depth_scale does not change, "
                 f"and their median is {median:.3g}"
             )
-        raise UserError(cause)
+        raise UserError(
+            f"depth_scale={depth_scale}: the median depth would be {median:.3g} m; is it 1000 or "
+            "10000?"
+        )
     return color, z
 
 

@@ -36,14 +36,7 @@ def format_metrics(metrics: dict[str, Any]) -> str:
 def briefly(metrics: dict[str, Any]) -> str:
     """Return the two that fit beside a bar: the loss, and how well it finds the object."""
     finds = "val/add/auc" if "val/add/auc" in metrics else "val/particles_on_object"
-    return format_metrics(
-        {name: metrics[name] for name in ("train/loss", finds) if name in metrics}
-    )
-
-
-def is_whole(name: str) -> bool:
-    """Tell whether a metric is of a whole validation, not of a part of its images."""
-    return name.startswith("val/") and "/by_" not in name
+    return format_metrics({k: metrics[k] for k in ("train/loss", finds) if k in metrics})
 
 
 class Lines(Callback):
@@ -63,11 +56,8 @@ class Lines(Callback):
     def on_train_batch_end(self, trainer: Trainer, pl_module: LightningModule, *_: Any) -> None:
         """Print a line where nothing was said for long."""
         if time.perf_counter() - self._last >= self.pause:
-            self._tell(
-                "training",
-                trainer,
-                {k: v for k, v in trainer.callback_metrics.items() if k == "train/loss"},
-            )
+            loss = {k: v for k, v in trainer.callback_metrics.items() if k == "train/loss"}
+            self._tell("training", trainer, loss)
 
     def on_validation_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Print the line."""
@@ -85,29 +75,21 @@ class Lines(Callback):
             return
         self._last, done, batches = now, int(past[2]) + 1, sum(map(int, trainer.num_test_batches))
         left = format_duration((now - self._began) / done * (batches - done))
-        say(
-            self.console,
-            "testing",
-            f"batch {done} of {batches}: {left} left",
-            batch=done,
-            batches=batches,
-        )
+        sentence = f"batch {done} of {batches}: {left} left"
+        say(self.console, "testing", sentence, batch=done, batches=batches)
 
     def _tell(self, event: str, trainer: Trainer, seen: dict[str, Any]) -> None:
         step, steps, self._last = trainer.global_step, trainer.max_steps, time.perf_counter()
         rate = (step - self._step) / max(self._last - self._began, 1e-9)
-        left = (
-            f", {format_duration((steps - step) / rate)} left" if rate > 0 and steps > step else ""
-        )
-        words = ", ".join(
-            part for part in (format_metrics(seen), f"{rate:.2f} steps/s{left}") if part
-        )
-        numbers = {
-            name: float(value)
-            for name, value in seen.items()
-            if name == "train/loss" or is_whole(name)
-        }
-        numbers = {"step": step, "steps": steps, **numbers, "steps_per_second": rate}
+        pace = f"{rate:.2f} steps/s"
+        if rate > 0 and steps > step:
+            pace += f", {format_duration((steps - step) / rate)} left"
+        words = ", ".join(part for part in (format_metrics(seen), pace) if part)
+        numbers: dict[str, float] = {"step": step, "steps": steps}
+        for name, value in seen.items():
+            if name == "train/loss" or (name.startswith("val/") and "/by_" not in name):
+                numbers[name] = float(value)
+        numbers["steps_per_second"] = rate
         say(self.console, event, f"step {step} of {steps}: {words}", **numbers)
 
 
@@ -146,10 +128,8 @@ class Bars(Callback):
         """Put a line in its place."""
         self._looked()
         if not trainer.sanity_checking:
-            self._shown().console.print(
-                f"step {trainer.global_step}: {format_metrics(trainer.callback_metrics)}",
-                highlight=False,
-            )
+            said = f"step {trainer.global_step}: {format_metrics(trainer.callback_metrics)}"
+            self._shown().console.print(said, highlight=False)
 
     def on_test_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Open a bar for the test."""
@@ -169,15 +149,9 @@ class Bars(Callback):
 
     def _shown(self) -> Progress:
         if self._bars is None:
-            columns = (
-                TextColumn("{task.description}"),
-                BarColumn(24),
-                MofNCompleteColumn(),
-                TimeElapsedColumn(),
-            )
-            self._bars = Progress(
-                *columns, TimeRemainingColumn(), TextColumn("[dim]{task.fields[said]}")
-            )
+            name, said = TextColumn("{task.description}"), TextColumn("[dim]{task.fields[said]}")
+            times = TimeElapsedColumn(), TimeRemainingColumn()
+            self._bars = Progress(name, BarColumn(24), MofNCompleteColumn(), *times, said)
             self._bars.start()
         return self._bars
 

@@ -31,11 +31,7 @@ def report(job: Job) -> None:
     """Write report.html and its charts as PNGs into `out`; else into the run or sweep, or the
     second of two runs.
     """
-    given = {
-        key: getattr(job.cfg, name)
-        for key, name in KEYS.items()
-        if getattr(job.cfg, name) is not None
-    }
+    given = {key: job.cfg[name] for key, name in KEYS.items() if job.cfg[name] is not None}
     if len(given) != 1:
         raise UserError(
             "give one of run=RUN, a run's folder, sweep=DIR, a sweep's, and runs=A,B, "

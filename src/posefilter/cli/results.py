@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from posefilter.cli.console import JSON, Files, ended, finite, show_table
+from posefilter.cli.console import Files, ended, finite, show_table
 from posefilter.cli.job import Job
 from posefilter.cli.machine import device_name, git_state, versions
 from posefilter.files import open_whole
@@ -75,7 +75,6 @@ def show(
         for key, value in numbers.items()
         if value is not None
     ]
-    if console != JSON:
-        show_table(title, rows)
+    show_table(console, title, rows)
     told = {key: metrics[key] for key in _TOLD if key in metrics}
     ended(console, event, files, following, title=title, **told)

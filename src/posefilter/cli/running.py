@@ -162,11 +162,5 @@ def job_of(cfg: DictConfig) -> Job:
     # as typed: what an interpolation stands for may be a secret, or not known yet
     typed: Any = OmegaConf.to_container(own.overrides.task, resolve=False)
     replace_typed(cfg, typed)
-    return Job(
-        cfg,
-        choices,
-        typed,
-        Path(own.runtime.output_dir),
-        own.job.config_name or "",
-        swept,
-    )
+    folder, name = Path(own.runtime.output_dir), own.job.config_name or ""
+    return Job(cfg, choices, typed, folder, name, swept)

@@ -31,7 +31,8 @@ class Stages:
 
     def __init__(self, file: Path, form: Mapping[str, Any] | None = None) -> None:
         self.file = file
-        self.content: dict[str, Any] = {"stages": {}, "values": {}}
+        self.values: dict[str, Any] = {}  # what stages have found out, by name; `keep` writes it
+        self._stages: dict[str, Any] = {}
         if file.is_file():
             try:
                 found = read_json(file, _LONGEST, parse_json)
@@ -40,21 +41,15 @@ class Stages:
                 raise UserError(
                     f"{file}: is no record of an onboarding any more; choose another out= ({error})"
                 ) from error
-            self.content = {name: found[name] for name in self.content}
-            for stage in self.content["stages"].values():
+            self._stages, self.values = found["stages"], found["values"]
+            for stage in self._stages.values():
                 settings = stage["settings"]
                 stage["settings"] = {_RENAMED.get(key, key): settings[key] for key in settings}
 
     @property
-    def values(self) -> dict[str, Any]:
-        """What stages have found out, by name; `keep` writes it."""
-        values: dict[str, Any] = self.content["values"]
-        return values
-
-    @property
     def seconds(self) -> dict[str, float]:
         """How long each stage took, in all its sittings [s]."""
-        return {name: one["seconds"] for name, one in self.content["stages"].items()}
+        return {name: one["seconds"] for name, one in self._stages.items()}
 
     def keep(self, **values: Any) -> None:
         """Write down what a stage has found out."""
@@ -63,7 +58,7 @@ class Stages:
 
     def is_done(self, name: str, settings: Mapping[str, Any]) -> bool:
         """Tell whether a stage was finished with these settings."""
-        one = self.content["stages"].get(name)
+        one = self._stages.get(name)
         return bool(one and one.get("done") and not _differing(one["settings"], settings))
 
     def check(self, name: str, settings: Mapping[str, Any]) -> None:
@@ -72,15 +67,13 @@ class Stages:
         Raises:
             UserError: They do.
         """
-        before = self.content["stages"].get(name)
+        before = self._stages.get(name)
         others = [] if before is None else _differing(before["settings"], settings)
-        if not others:
-            return
-        other = ", ".join(others)
-        raise UserError(
-            f"out={self.file.parent}: its stage '{name}' was begun with other settings "
-            f"({other}); choose another out="
-        )
+        if others:
+            raise UserError(
+                f"out={self.file.parent}: its stage '{name}' was begun with other settings "
+                f"({', '.join(others)}); choose another out="
+            )
 
     def run(
         self, name: str, settings: Mapping[str, Any], work: Callable[[], None], costly: bool = False
@@ -98,13 +91,13 @@ class Stages:
         """
         if costly:
             self.check(name, settings)
-        stages = self.content["stages"]
+        stages = self._stages
         before = stages.get(name)
         same = before is not None and not _differing(before["settings"], settings)
         names = list(stages)
         for later in names[names.index(name) + 1 :] if before is not None else ():
             stages[later]["done"] = False
-        spent = before["seconds"] if same else 0.0
+        spent = stages[name]["seconds"] if same else 0.0
         stages[name] = {"settings": _plain(settings), "done": False, "seconds": spent}
         self._write()
         began = time.perf_counter()
@@ -116,7 +109,7 @@ class Stages:
             self._write()
 
     def _write(self) -> None:
-        write_json(self.file, self.content)
+        write_json(self.file, {"stages": self._stages, "values": self.values})
 
 
 def _plain(settings: Mapping[str, Any]) -> dict[str, Any]:

@@ -39,7 +39,7 @@ class SweepSummary(Callback):
             files = {name: folder / name for name in names if (folder / name).is_file()}
             console = str(config.get("console", JSON))
             if console != JSON:
-                print((folder / "summary.md").read_text())
+                print((folder / "summary.md").read_text(encoding="utf-8"))
             ended(console, "swept", files, [typed("report", sweep=folder)], failed=failed)
         if failed:
             raise Carrier(
@@ -59,12 +59,8 @@ def summarize(folder: Path) -> list[Row]:
     sweep = read_sweep(folder)
     rows = list_rows(sweep)
     found = [name for name in COLUMNS if any(row.get(name) is not None for row in rows)]
-    names = [
-        *sweep.axes,
-        *found,
-        *(["error"] if any("error" in row for row in rows) else []),
-        "folder",
-    ]
+    errors = ["error"] if any("error" in row for row in rows) else []
+    names = [*sweep.axes, *found, *errors, "folder"]
     with open_whole_text(folder / "summary.csv") as file:
         writer = csv.DictWriter(file, names, extrasaction="ignore", lineterminator="\n")
         writer.writeheader()

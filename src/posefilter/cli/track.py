@@ -101,9 +101,8 @@ def track(job: Job) -> None:
     write_json(folder / "metrics.json", metrics)
     log.remove()
     files |= {"tracks": folder / "tracks.csv", "metrics": folder / "metrics.json"}
-    if cfg.console != JSON:
-        for name, figures in metrics.items():
-            show_table(name, list_figures(figures))
+    for name, figures in metrics.items():
+        show_table(cfg.console, name, list_figures(figures))
     ended(cfg.console, "tracked", files, [], metrics=metrics)
     if isinstance(broken, UserError):
         count = len({(row.video, row.frame) for row in rows})
@@ -124,11 +123,8 @@ def follow(
     log: TrackLog,
 ) -> None:
     """Track the objects through one video, write its pictures, and log its rows as they come."""
-    methods = [
-        m
-        for m in estimator.methods
-        if video.objects is None or m.object_model.name in video.objects
-    ]
+    shown = estimator.objects if video.objects is None else video.objects
+    methods = [method for method in estimator.methods if method.object_model.name in shown]
     if not methods:
         return
     tracker = Tracker(Estimator(methods), settings, cfg.seed, threads)
@@ -224,15 +220,12 @@ def draw_frame(
 
 def list_seen(results: Sequence[TrackResult]) -> list[Seen]:
     """Return the objects of a frame as the 3-D view takes them."""
-    return [
-        Seen(
-            one.object,
-            one.pose if one.is_tracked else None,
-            one.object_model.center.cpu().double().numpy(),
-            float("nan") if one.presence is None else float(one.presence),
-        )
-        for one in results
-    ]
+    seen = []
+    for one in results:
+        pose, center = one.pose if one.is_tracked else None, one.object_model.center
+        presence = float("nan") if one.presence is None else float(one.presence)
+        seen.append(Seen(one.object, pose, center.cpu().double().numpy(), presence))
+    return seen
 
 
 def make_settings(node: DictConfig) -> TrackerSettings:
@@ -242,13 +235,10 @@ def make_settings(node: DictConfig) -> TrackerSettings:
     """
     plain: Any = resolve(node)
     try:
-        return TrackerSettings(
-            **{
-                **plain,
-                "motion": ConstantVelocity(**plain["motion"]),
-                **{x: FilterSettings(**plain[x]) for x in ("follow", "probe", "search")},
-            }
-        )
+        plain["motion"] = ConstantVelocity(**plain["motion"])
+        for name in ("follow", "probe", "search"):
+            plain[name] = FilterSettings(**plain[name])
+        return TrackerSettings(**plain)
     except TypeError as error:
         raise UserError(f"tracker: {error}") from error
 

@@ -81,14 +81,8 @@ def build(job: Job) -> Run:
     method.set_object(object_model)
     if job.cfg.warm_start:
         starts = read_starts(job.cfg.warm_start, object_model.name)
-        copied, left = warm_start(method, starts)
-        log.info(
-            "warm start from %s (%d files): %d tensors copied, %d left as drawn",
-            job.cfg.warm_start,
-            len(starts),
-            copied,
-            left,
-        )
+        told = (job.cfg.warm_start, len(starts), *warm_start(method, starts))
+        log.info("warm start from %s (%d files): %d tensors copied, %d left as drawn", *told)
     rehearse(method, data)
     if not is_follower():
         write_json(job.folder / "data.json", {**data.describe(), "split": data.split_record()})
@@ -230,14 +224,10 @@ def finish(
     inside = Path("outputs").resolve() in job.folder.resolve().parents
     everything = "tensorboard --logdir outputs" if is_installed() else "make board"
     board = everything if inside else f"tensorboard --logdir {shlex.quote(str(job.folder))}"
-    show(
-        metrics,
-        f"{job.choices['model']}, loss {job.choices['loss']}",
-        job.cfg.console,
-        "trained",
-        {"run": job.folder, "checkpoint": tested, "metrics": file},
-        [] if job.swept else [report, evaluate, board],
-    )
+    title = f"{job.choices['model']}, loss {job.choices['loss']}"
+    files = {"run": job.folder, "checkpoint": tested, "metrics": file}
+    following = [] if job.swept else [report, evaluate, board]
+    show(metrics, title, job.cfg.console, "trained", files, following)
     return metrics
 
 

@@ -175,7 +175,8 @@ def check_name(name: str, where: str, scope: Scope) -> None:
     if plain and (
         is_listed(name, scope)
         or is_component(module, scope)
-        or is_listed_module(module)
+        # a misspelt name may then be told: it is built only if listed itself
+        or listed_in(module, Scope.RECIPE)
         or is_plugin(name)
     ):
         return
@@ -187,13 +188,6 @@ def check_name(name: str, where: str, scope: Scope) -> None:
         f"posefilter's own components, "
         f"a list of torch and lightning classes, and packages that you trust: {how}"
     )
-
-
-def is_listed_module(module: str) -> bool:
-    """Tell whether a module has names in the list: a misspelt one may then be told (it is built
-    only if listed itself).
-    """
-    return any(name.rpartition(".")[0] == module for name in _RECIPE_NAMES)
 
 
 def listed_in(module: str, scope: Scope) -> list[str]:

@@ -14,7 +14,7 @@ import yaml
 from hydra.core.config_store import ConfigStore
 
 from posefilter.cli.choices import choice_folders, list_choices
-from posefilter.cli.console import is_installed
+from posefilter.cli.console import name_program
 from posefilter.cli.main import COMMANDS
 
 _SETTING = re.compile(r"^(\w+): *(.*?) *(?:# *(.*))?$")  # a key at the top of a file
@@ -70,7 +70,7 @@ def describe_command(name: str, conf: Path, arguments: Sequence[str] = ()) -> st
     """
     text = (conf / f"{name}.yaml").read_text(encoding="utf-8")
     width = max(_NARROWEST, min(_WIDEST, shutil.get_terminal_size((100, 24)).columns))
-    program, script = _program(name), f"python {name}.py"
+    program, script = name_program(name), f"python {name}.py"
     examples = [
         line.removeprefix("# ").replace(script, program)
         for line in text.splitlines()
@@ -78,18 +78,7 @@ def describe_command(name: str, conf: Path, arguments: Sequence[str] = ()) -> st
     ]
     groups = list(list_groups(name, [conf, *choice_folders(arguments)]))
     lines = [f"{name}: {COMMANDS[name]}", ""]
-    lines += [
-        part
-        for example in examples
-        for part in textwrap.wrap(
-            example,
-            width,
-            initial_indent="  ",
-            subsequent_indent="      ",
-            break_long_words=False,
-            break_on_hyphens=False,
-        )
-    ]
+    lines += [part for one in examples for part in _wrap(f"  {one}", width, 6)]
     if groups:
         lines += ["", f"choices, typed group=choice; {_explain_defaults(name)}"]
         for group in groups:
@@ -177,10 +166,6 @@ def _list_stored(group: str) -> set[str]:
         return set()
 
 
-def _program(name: str) -> str:
-    return f"posefilter {name}" if is_installed() else f"python {name}.py"
-
-
 def _shorten(text: str, width: int) -> str:
     """Return as many of a comment's clauses as fit into one line; at least the first."""
     clauses = re.split(r"(?<=;) ", text)
@@ -191,15 +176,15 @@ def _shorten(text: str, width: int) -> str:
 
 def _entry(left: str, right: str, width: int) -> list[str]:
     """Return a name and what is said of it, in two columns."""
-    indent = " " * _INDENT
     start = f"  {left}".ljust(_INDENT - 1)
     if len(start) >= _INDENT:
         start = f"{start} "
-    return textwrap.wrap(
-        f"{start} {right}" if right else start,
-        width,
-        subsequent_indent=indent,
-        drop_whitespace=True,
-        break_long_words=False,
-        break_on_hyphens=False,
-    ) or [start]
+    return _wrap(f"{start} {right}" if right else start, width, _INDENT)
+
+
+def _wrap(text: str, width: int, indent: int) -> list[str]:
+    """Return a text's lines, those after the first indented."""
+    lines = textwrap.TextWrapper(
+        width, subsequent_indent=" " * indent, break_long_words=False, break_on_hyphens=False
+    )
+    return lines.wrap(text)

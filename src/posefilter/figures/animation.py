@@ -62,9 +62,8 @@ class Animation:
         self.posed = isinstance(space, PoseSpace)
         self.views = [full_view(height, wide, WIDTH // 2 if self.posed else 480)]
         if self.posed and target:
-            self.views.append(
-                close_up(np.concatenate(list(target)), height, wide, WIDTH // 2, margin=0.4)
-            )
+            places = np.concatenate(list(target))
+            self.views.append(close_up(places, height, wide, WIDTH // 2, margin=0.4))
         self.grounds = [fade(view.show(rgb), 0.5) for view in self.views]
         self.head = compose_figure(title)
         entries = [("truth", TRUTH), *([("some outlines", _LINE)] if self.posed else [])]
@@ -79,12 +78,12 @@ class Animation:
         shown = choose_steps(len(self.trace.particles), max_steps)
         between = between or (2 if len(shown) <= 8 else 1)
         for before, number in zip([shown[0], *shown], shown, strict=False):
-            weights = normalize_weights(self.trace.particles[number], 0)
+            weights = normalize_weights(self.trace.particles[number])
             few = choose_by_weight(weights, 24).unique()
             ancestors = self.ancestors(number, before)
             ends = self.drawn(number, torch.arange(len(weights)), few)
             starts = self.drawn(before, ancestors, ancestors[few])
-            noise = describe_noise(self.trace, 0, number, "mm" if self.posed else "px")
+            noise = describe_noise(self.trace, number, "mm" if self.posed else "px")
             caption = f"step {number} of {len(self.trace.particles) - 1}: {noise}"
             for k in range(between if number else 1):
                 share = (k + 1) / between
@@ -127,6 +126,5 @@ class Animation:
             view.outline(picture, outline_hulls(corners), _LINE, 1, halo=False)
             view.outline(picture, self.target, TRUTH, 2)
             parts.append(picture)
-        return np.concatenate(
-            [self.head, add_caption(center_part(arrange_row(parts)), caption), self.foot]
-        )
+        middle = add_caption(center_part(arrange_row(parts)), caption)
+        return np.concatenate([self.head, middle, self.foot])

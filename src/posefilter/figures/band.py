@@ -107,11 +107,7 @@ def draw_band(
     ).round()
     for part in (surely, maybe):
         draw_lines(picture, trace_outline(part), _BAND, 1, closed=True, halo=False)
-    draw_lines(picture, trace_outline(_smooth(cover) > 0.5), ESTIMATE, 1, closed=True, halo=False)
+    smooth = cv2.GaussianBlur(cover, (3, 3), 0)  # without single pixels' steps
+    draw_lines(picture, trace_outline(smooth > 0.5), ESTIMATE, 1, closed=True, halo=False)
     entries = [("outline", ESTIMATE), (f"{100 * level:g} % band", _BAND)]
     return np.concatenate([picture, draw_row(picture.shape[1], caption, entries)])
-
-
-def _smooth(cover: np.ndarray) -> np.ndarray:
-    """Return the probabilities without single pixels' steps."""
-    return np.asarray(cv2.GaussianBlur(cover, (3, 3), 0))

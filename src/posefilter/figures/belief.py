@@ -88,21 +88,15 @@ def draw_belief(
         "Photograph: where the particles put the object's center, colored by weight.",
         "Below: shares of the belief. Translations are from its mean, rotations from the estimate.",
     ]
-    notes = np.concatenate(
-        [draw_legend(entries, half), *(draw_text(text, DETAIL, half) for text in words)]
-    )
+    notes = [draw_legend(entries, half), *(draw_text(text, DETAIL, half) for text in words)]
+    centers = arrange_grid([draw_centers(poses, weights, marks, object_model, rgb, K, half)], 1)
     return compose_figure(
         title or f"Belief\n{object_model.name}",
         draw_text(sure, CAPTION, bold=True),
         draw_text(other, CAPTION),
         draw_rotations(poses, weights, marks, axis, tile_width(1)),
         draw_turn_scale(),
-        arrange_row(
-            [
-                arrange_grid([draw_centers(poses, weights, marks, object_model, rgb, K, half)], 1),
-                notes,
-            ]
-        ),
+        arrange_row([centers, np.concatenate(notes)]),
         draw_weight_scale(),
         *draw_marginals(poses, weights, best, true, object_model),
     )
@@ -181,7 +175,7 @@ def draw_centers(
     dots = project(origin_of(poses, center), camera).numpy()
     order = np.argsort(weights.numpy(), kind="stable")
     best = marks[0].pose
-    left, top, right, _ = choose_window(
+    left, top, right = choose_window(
         dots, weights.numpy(), best, object_model, camera.numpy(), *rgb.shape[:2]
     )
     view = View(left, top, 2 * size / (right - left), 2 * size, 2 * size)
@@ -201,23 +195,17 @@ def choose_window(
     K: np.ndarray,
     height: int,
     width: int,
-) -> tuple[float, float, float, float]:
+) -> tuple[float, float, float]:
     """Return the square part of the frame that shows the object as estimated, and 98 % of the
-    particles.  -> [px].
+    particles: its left, top and right [px].
     """
-    z = max(float(origin_of(best, object_model.center.cpu().double())[2]), 0.05)
-    middle = project(origin_of(best, object_model.center.cpu().double())[None], torch.as_tensor(K))[
-        0
-    ].numpy()
-    reach = 1.1 * object_model.radius * K[0, 0] / z
+    center = origin_of(best, object_model.center.cpu().double())
+    middle = project(center[None], torch.as_tensor(K))[0].numpy()
     far = np.abs(dots - middle).max(1)
     order = np.argsort(far)
-    reach = max(
-        reach,
-        float(far[order][np.searchsorted(np.cumsum(weights[order]), 0.98).clip(max=len(far) - 1)])
-        * 1.1,
-    )
-    reach = min(reach, max(height, width) / 2)
+    last = np.searchsorted(np.cumsum(weights[order]), 0.98).clip(max=len(far) - 1)
+    whole = 1.1 * object_model.radius * K[0, 0] / max(float(center[2]), 0.05)
+    reach = min(max(whole, float(far[order][last]) * 1.1), max(height, width) / 2)
     u = float(np.clip(middle[0], min(reach, width / 2), max(width - reach, width / 2)))
     v = float(np.clip(middle[1], min(reach, height / 2), max(height - reach, height / 2)))
-    return u - reach, v - reach, u + reach, v + reach
+    return u - reach, v - reach, u + reach

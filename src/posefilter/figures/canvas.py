@@ -185,15 +185,16 @@ def draw_tag(
 
 
 def draw_dots(
-    picture: np.ndarray, pixels: np.ndarray, colors: np.ndarray, radius: float | np.ndarray
+    picture: np.ndarray, pixels: np.ndarray, colors: np.ndarray | Color, radius: float | np.ndarray
 ) -> None:
     """Draw anti-aliased discs, later ones on top.
 
-    (P, 2) [px], (P, 3) uint8, one radius or (P,) [px].
+    (P, 2) [px], one color or (P, 3) uint8, one radius or (P,) [px].
     """
     at = np.round(np.clip(pixels, -_FARTHEST, _FARTHEST) * 2**_SHIFT).astype(int)
     sizes = np.broadcast_to(np.round(np.asarray(radius) * 2**_SHIFT).astype(int), len(at))
-    for (u, v), color, size in zip(at.tolist(), colors.tolist(), sizes.tolist(), strict=True):
+    paint = np.broadcast_to(colors, (len(at), 3))
+    for (u, v), color, size in zip(at.tolist(), paint.tolist(), sizes.tolist(), strict=True):
         cv2.circle(picture, (u, v), size, color, -1, cv2.LINE_AA, _SHIFT)
 
 
@@ -205,9 +206,8 @@ def stamp_dots(picture: np.ndarray, pixels: np.ndarray, colors: np.ndarray, radi
     line = np.arange(-radius, radius + 1)
     disc = np.stack(np.meshgrid(line, line), -1).reshape(-1, 2)
     disc = disc[(disc * disc).sum(1) <= radius * (radius + 0.5)]
-    at = (np.round(np.clip(pixels, -_FARTHEST, _FARTHEST)).astype(int)[:, None] + disc).reshape(
-        -1, 2
-    )
+    places = np.round(np.clip(pixels, -_FARTHEST, _FARTHEST)).astype(int)
+    at = (places[:, None] + disc).reshape(-1, 2)
     seen = ((at >= 0) & (at < [picture.shape[1], picture.shape[0]])).all(1)
     picture[at[seen, 1], at[seen, 0]] = np.repeat(colors, len(disc), axis=0)[seen]
 
@@ -216,11 +216,8 @@ def halve(picture: np.ndarray) -> np.ndarray:
     """Return a picture at half its size, each pixel the mean of four: what was drawn at twice the
     size is smooth.
     """
-    return np.asarray(
-        cv2.resize(
-            picture, (picture.shape[1] // 2, picture.shape[0] // 2), interpolation=cv2.INTER_AREA
-        )
-    )
+    size = (picture.shape[1] // 2, picture.shape[0] // 2)
+    return np.asarray(cv2.resize(picture, size, interpolation=cv2.INTER_AREA))
 
 
 @cache
@@ -261,16 +258,10 @@ def arrange_grid(tiles: Sequence[np.ndarray], columns: int, gap: int = 6) -> np.
     width = max(tile.shape[1] for tile in tiles)
     rows = []
     for i in range(0, len(tiles), columns):
-        row = np.full(
-            (
-                max(t.shape[0] for t in tiles[i : i + columns]) + gap,
-                columns * (width + gap) + gap,
-                3,
-            ),
-            255,
-            np.uint8,
-        )
-        for k, tile in enumerate(tiles[i : i + columns]):
+        own = tiles[i : i + columns]
+        height = max(tile.shape[0] for tile in own)
+        row = np.full((height + gap, columns * (width + gap) + gap, 3), PAPER, np.uint8)
+        for k, tile in enumerate(own):
             left = gap + k * (width + gap)
             row[: tile.shape[0], left : left + tile.shape[1]] = tile
         rows.append(row)

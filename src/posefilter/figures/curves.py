@@ -41,22 +41,11 @@ def draw_health(
         numbers = info.factor * np.asarray(values, float)
         low, high = choose_bounds(info, numbers)
         y = Axis(info.unit, low, high, choose_ticks(low, high))
-        places = np.arange(len(numbers), dtype=float)
-        panel = draw_curve_panel(
-            [(numbers, _LINE)],
-            places,
-            make_iteration_axis(len(numbers)),
-            y,
-            width,
-            _HEIGHT,
-            thick=3,
-        )
+        x, places = make_iteration_axis(len(numbers)), np.arange(len(numbers), dtype=float)
+        panel = draw_curve_panel([(numbers, _LINE)], places, x, y, width, _HEIGHT, thick=3)
         panels.append(add_caption(panel, info.short or info.label))
-    return compose_figure(
-        title,
-        draw_text(f"means over {images} image{'s' * (images != 1)}", DETAIL),
-        arrange_grid(panels, 2),
-    )
+    note = draw_text(f"means over {images} image{'s' * (images != 1)}", DETAIL)
+    return compose_figure(title, note, arrange_grid(panels, 2))
 
 
 def draw_shares(

@@ -83,23 +83,19 @@ def draw_pose_field(field: PoseField, title: str, estimate: np.ndarray | None = 
             x, y = (make_shift_axis(f"along {_NAMES[axis]} [mm]", extent) for axis in (a, b))
             marks = [Mark(0, 0, TRUTH)]
             if estimate is not None:
-                marks.append(
-                    Mark(1000 * float(estimate[a]), 1000 * float(estimate[b]), ESTIMATE, "square")
-                )
+                u, v = 1000 * float(estimate[a]), 1000 * float(estimate[b])
+                marks.append(Mark(u, v, ESTIMATE, "square"))
             row.append(draw_heat_panel(color_scores(values, low), x, y, _COLUMN, marks))
         ends = draw_color_scale(f"{low:.3g}", "0", width=_COLUMN, size=DETAIL)
         rows[0][-1] = add_caption(np.concatenate([ends, rows[0][-1]]), f"{1000 * sigma:.3g} mm")
         x = Axis("rotation [degrees]", -180, 180, (-180, 0, 180))
-        y = Axis(
-            "score", low, max(1.15 * max(float(own.max()), 0.0), -0.06 * low), (round_down(low), 0)
-        )
-        lines = [(curve, color) for curve, color in zip(field.turns[k], AXES, strict=True)]
+        top = max(1.15 * max(float(own.max()), 0.0), -0.06 * low)
+        y = Axis("score", low, top, (round_down(low), 0))
+        lines = list(zip(field.turns[k], AXES, strict=True))
         rows[3].append(draw_curve_panel(lines, field.degrees, x, y, _COLUMN, 170))
     entries = [("truth", TRUTH), *([] if estimate is None else [("estimate", ESTIMATE)])]
-    entries += [
-        ("beats truth", _ABOVE),
-        *((f"rotation {name}" if name == "x" else name, c) for name, c in list_axes()),
-    ]
+    (first, red), *others = list_axes()
+    entries += [("beats truth", _ABOVE), (f"rotation {first}", red), *others]
     note = (
         "score: log-likelihood less the truth's [nat], of the true pose translated along and "
         "rotated about the object's axes"
@@ -137,12 +133,9 @@ def round_down(value: float) -> float:
     if value == 0:
         return 0.0
     power = 10.0 ** np.floor(np.log10(abs(value)))
-    steps = [
-        step
-        for step in (1, 1.5, 2, 2.5, 3, 4, 5, 6, 7, 8, 9)
-        if step * power <= abs(value) * (1 + 1e-9)
-    ]
-    return float(np.sign(value) * steps[-1] * power)
+    most = abs(value) * (1 + 1e-9)
+    step = max(x for x in (1, 1.5, 2, 2.5, 3, 4, 5, 6, 7, 8, 9) if x * power <= most)
+    return float(np.sign(value) * step * power)
 
 
 def draw_point_field(
@@ -170,19 +163,14 @@ def draw_point_field(
         most = max(float(np.abs(field.scores).max()), float(np.abs(field.own).max()), 1e-6)
         tiles = []
         for sigma, scores, own in zip(field.sigmas, field.scores, field.own, strict=True):
-            panel = draw_heat_panel(
-                map_colors(scores, -most, most, "RdBu_r"), x, y, _COLUMN, marks, dots
-            )
+            colors = map_colors(scores, -most, most, "RdBu_r")
+            panel = draw_heat_panel(colors, x, y, _COLUMN, marks, dots)
             note = f"at the ring: {own:+.2f}"
             tiles.append(add_caption(panel, f"{1000 * sigma:.3g} mm", note=note))
         place = f"plane {_NAMES[normal]} = {1000 * field.place[normal]:.0f} mm"
-        parts += [
-            draw_text(f"{'On' if field.on else 'Off'} it: {place}, at noise levels of", CAPTION),
-            arrange_grid(tiles, len(tiles)),
-        ]
-        parts.append(
-            draw_color_scale(f"score: {-most:.2g}", f"{most:+.2g}", "RdBu_r", size=CAPTION)
-        )
+        head = f"{'On' if field.on else 'Off'} it: {place}, at noise levels of"
+        scale = draw_color_scale(f"score: {-most:.2g}", f"{most:+.2g}", "RdBu_r", size=CAPTION)
+        parts += [draw_text(head, CAPTION), arrange_grid(tiles, len(tiles)), scale]
     entries = [("where the truth puts it", TRUTH), ("surface near the slice", SURFACE)]
     return compose_figure(title, *parts, draw_legend(entries))
 
@@ -192,6 +180,6 @@ def draw_marked_pixel(rgb: np.ndarray, pixel: tuple[int, int]) -> np.ndarray:
     view = full_view(rgb.shape[0], rgb.shape[1], tile_width(2))
     picture = view.show(rgb)
     at = view.place(np.array([pixel]))
-    draw_dots(picture, at, np.array([[0, 0, 0]]), 7)
-    draw_dots(picture, at, np.array([TRUTH]), 5)
+    draw_dots(picture, at, (0, 0, 0), 7)
+    draw_dots(picture, at, TRUTH, 5)
     return picture

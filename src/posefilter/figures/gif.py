@@ -8,11 +8,7 @@ import numpy as np
 from matplotlib import colormaps
 from PIL import Image
 
-from posefilter.figures.canvas import (
-    INK,
-    PAPER,
-    TRUTH,
-)
+from posefilter.figures.canvas import INK, PAPER, TRUTH
 from posefilter.figures.silhouettes import _LINE
 
 # colors that an animation's palette must have, however few of its pixels show them: weights, lines,
@@ -32,14 +28,10 @@ def encode_gif(
     last is held.
     """
     # as good for choosing colors, and nine times sooner
-    few = np.ascontiguousarray(frames[-1][::3, ::3])
-    ground = (
-        Image.fromarray(few).quantize(colors - len(_KEPT), Image.Quantize.MEDIANCUT).getpalette()
-        or []
-    )
-    palette = np.concatenate([_KEPT, np.reshape(ground, (-1, 3))[: colors - len(_KEPT)]]).astype(
-        np.uint8
-    )
+    few, free = np.ascontiguousarray(frames[-1][::3, ::3]), colors - len(_KEPT)
+    ground = Image.fromarray(few).quantize(free, Image.Quantize.MEDIANCUT).getpalette() or []
+    own = np.reshape(ground, (-1, 3))[:free]
+    palette = np.concatenate([_KEPT, own]).astype(np.uint8)
     palette = np.pad(palette, ((0, colors - len(palette)), (0, 0)))
     table = index_nearest_colors(palette)
     indexed = [table[(frame >> 3) @ np.array([1024, 32, 1], np.uint16)] for frame in frames]
@@ -51,14 +43,9 @@ def encode_gif(
         images[-1].putpalette(palette.tobytes())
     durations = [milliseconds] * (len(frames) - 1) + [hold]
     stream = BytesIO()
-    save: dict[str, Any] = {
-        "duration": durations,
-        "loop": 0,
-        "transparency": colors,
-        "disposal": 1,
-        "optimize": False,
-    }
-    images[0].save(stream, "GIF", save_all=True, append_images=images[1:], **save)
+    save: dict[str, Any] = {"save_all": True, "append_images": images[1:], "duration": durations}
+    save |= {"loop": 0, "transparency": colors, "disposal": 1, "optimize": False}
+    images[0].save(stream, "GIF", **save)
     return stream.getvalue()
 
 

@@ -61,21 +61,15 @@ def draw_proposals(
     edge = outline_object(truth, shape, view.camera(K), view.height, view.width)
     chance = draw_heat_map(rgb, proposals.chance, view)
     draw_lines(chance, edge, TRUTH, 2, closed=True)
-    drawn = view.finer(2).show(rgb)
-    draw_many_axes(drawn, view.finer(2).place(proposals.axes), 0.8)
-    draw_dots(
-        drawn,
-        view.finer(2).place(proposals.axes[:, 0]),
-        np.tile(np.array([_PROPOSED]), (len(proposals.axes), 1)),
-        5,
-    )
+    fine = view.finer(2)
+    drawn = fine.show(rgb)
+    draw_many_axes(drawn, fine.place(proposals.axes), 0.8)
+    draw_dots(drawn, fine.place(proposals.axes[:, 0]), _PROPOSED, 5)
     drawn = halve(drawn)
     draw_lines(drawn, edge, TRUTH, 2, closed=True)
-    mean = (
-        f"{1000 * proposals.error:.0f} mm off on average"
-        if np.isfinite(proposals.error)
-        else "of the object's own frame"
-    )
+    mean = "of the object's own frame"
+    if np.isfinite(proposals.error):
+        mean = f"{1000 * proposals.error:.0f} mm off on average"
     predicted = draw_point_map(proposals.coordinates, proposals.chance, view)
     true = draw_point_map(proposals.true, proposals.on.astype(float), view)
     tiles = [

@@ -29,7 +29,8 @@ ESTIMATE: Color = (214, 33, 156)
 OBJECT_AXES = "xyz"
 
 
-CAMERA_AXES = ("right", "down", "away")  # camera axes
+CAMERA_AXES = ("right [mm]", "down [mm]", "away [mm]")
+_ABOUT = tuple(f"about {name} [degrees]" for name in OBJECT_AXES)
 
 
 def compute_offsets(
@@ -67,9 +68,8 @@ def compute_marginals(
     for kind, unit in enumerate((1000.0, 180 / math.pi)):
         for i in range(3):
             marks = [float(part[kind][i]) * unit for part in parts[1:]]
-            out[kind].append(
-                compute_histogram(parts[0][kind][:, i].numpy() * unit, weights.numpy(), marks)
-            )
+            values = parts[0][kind][:, i].numpy() * unit
+            out[kind].append(compute_histogram(values, weights.numpy(), marks))
     return out
 
 
@@ -84,32 +84,22 @@ def draw_marginals(
     translations, rotations = compute_marginals(
         poses, weights, best, true, object_model.center.cpu().double()
     )
-    names = [
-        [f"{CAMERA_AXES[i]} [mm]" for i in range(3)],
-        [f"about {name} [degrees]" for name in OBJECT_AXES],
+    moved = [draw_marginal(*one) for one in zip(translations, CAMERA_AXES, strict=True)]
+    turned = [draw_marginal(*one) for one in zip(rotations, _ABOUT, strict=True)]
+    return [
+        draw_text("translation of the center", CAPTION),
+        arrange_grid(moved, 3),
+        draw_text("rotation about the object's axes", CAPTION),
+        arrange_grid(turned, 3),
     ]
-    out = []
-    for kind, row, labels in (
-        ("translation of the center", translations, names[0]),
-        ("rotation about the object's axes", rotations, names[1]),
-    ):
-        out.append(draw_text(kind, CAPTION))
-        out.append(
-            arrange_grid(
-                [draw_marginal(one, label) for one, label in zip(row, labels, strict=True)], 3
-            )
-        )
-    return out
 
 
 def draw_marginal(one: Marginal, label: str) -> np.ndarray:
     """Draw one histogram."""
     low, high = float(one.edges[0]), float(one.edges[-1])
     top = 1.1 * max(float(one.mass.max()), 1e-6)
-    x, y = (
-        Axis(label, low, high, choose_ticks(low, high, 3, 3 if max(-low, high) < 100 else 2)),
-        Axis("share", 0, top, choose_ticks(0, top, 2)),
-    )
+    x = Axis(label, low, high, choose_ticks(low, high, 3, 3 if max(-low, high) < 100 else 2))
+    y = Axis("share", 0, top, choose_ticks(0, top, 2))
     marks = list(zip(one.marks, (ESTIMATE, TRUTH), strict=False))[::-1]
     note = f"{one.beyond:.1%} lies beyond" if one.beyond >= 5e-4 else ""
     return add_caption(
@@ -122,16 +112,12 @@ def compute_histogram(
 ) -> Marginal:
     """Return a weighted histogram of the middle 95 % and a margin, wide enough for the marks."""
     order = np.argsort(values)
-    mass = np.cumsum(weights[order])
-    low, high = (
-        float(values[order][min(int(np.searchsorted(mass, q)), len(values) - 1)])
-        for q in (0.025, 0.975)
-    )
+    ends = np.searchsorted(np.cumsum(weights[order]), (0.025, 0.975)).clip(max=len(values) - 1)
+    low, high = (float(values[order][end]) for end in ends)
     margin = max(0.3 * (high - low), 1e-2)
     low, high = min(low - margin, *marks), max(high + margin, *marks)
     pad = 0.02 * (high - low)
-    mass, edges = np.histogram(
-        values, np.linspace(low - pad, high + pad, bins + 1), weights=weights
-    )
+    places = np.linspace(low - pad, high + pad, bins + 1)
+    mass, edges = np.histogram(values, places, weights=weights)
     beyond = float(weights[(values < low - pad) | (values > high + pad)].sum())
     return Marginal(mass, edges, (*marks,), beyond)

@@ -67,21 +67,15 @@ def draw_blank_map(width: int) -> np.ndarray:
 def _draw_blank(width: int) -> np.ndarray:
     picture = np.full((width // 2, width, 3), PAPER, np.uint8)
     line = np.linspace(-np.pi / 2, np.pi / 2, 91)
-    meridians = [
-        project_to_map(np.full(91, np.deg2rad(degrees)), line, width)
-        for degrees in (-135, -90, -45, 0, 45, 90, 135)
-    ]
-    parallels = [
-        project_to_map(2 * line, np.full(91, np.deg2rad(degrees)), width)
-        for degrees in (-60, -30, 0, 30, 60)
-    ]
-    draw_lines(picture, meridians + parallels, _GRID, max(1, width // 600), halo=False)
-    rim = np.concatenate(
-        [
-            project_to_map(np.full(91, np.pi), line, width),
-            project_to_map(np.full(91, -np.pi), line[::-1], width),
-        ]
-    )
+
+    def project_meridian(degrees: float) -> np.ndarray:
+        return project_to_map(np.full(91, np.deg2rad(degrees)), line, width)
+
+    grid = [project_meridian(degrees) for degrees in range(-135, 136, 45)]
+    levels = (np.full(91, np.deg2rad(degrees)) for degrees in range(-60, 61, 30))
+    grid += [project_to_map(2 * line, level, width) for level in levels]
+    draw_lines(picture, grid, _GRID, max(1, width // 600), halo=False)
+    rim = np.concatenate([project_meridian(180), project_meridian(-180)[::-1]])
     draw_lines(picture, [rim], INK, max(2, width // 400), closed=True, halo=False)
     return picture
 

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from functools import cache
+from itertools import product
 from typing import Any
 
 import cv2
@@ -55,17 +56,9 @@ def draw_overlay(
     view = full_view(rgb.shape[0], rgb.shape[1], max(width, rgb.shape[1]))
     drawn = np.full((4, 4), np.nan) if pose is None else pose  # which draws nothing
     picture = draw_poses(rgb, intrinsics, drawn, shape, view, color, truth, dashed=dashed)
-    entries = [] if pose is None else [(label, color), *list_axes()]
-    return np.concatenate(
-        [
-            picture,
-            draw_row(
-                picture.shape[1],
-                caption,
-                entries if truth is None else [("truth", TRUTH), *entries],
-            ),
-        ]
-    )
+    entries = [] if truth is None else [("truth", TRUTH)]
+    entries += [] if pose is None else [(label, color), *list_axes()]
+    return np.concatenate([picture, draw_row(picture.shape[1], caption, entries)])
 
 
 def draw_poses(
@@ -100,21 +93,16 @@ def view_poses(
 ) -> View:
     """Return a close-up of where poses put the object; the whole frame where that is nowhere."""
     bounds = get_bounds(shape)
-    corners = np.array(
-        [[bounds[i, 0], bounds[j, 1], bounds[k, 2]] for i in (0, 1) for j in (0, 1) for k in (0, 1)]
-    )
+    corners = np.array(list(product(*bounds.T)))
     found = []
     for pose in poses:
         camera = corners @ pose[:3, :3].T + pose[:3, 3]
         if np.isfinite(camera).all() and (camera[:, 2] > _NEAR).all():
-            found.append(
-                np.clip(_project(camera, np.asarray(K, np.float64)), 0, [width - 1, height - 1])
-            )
-    return (
-        close_up(np.concatenate(found), height, width, shown, margin=0.12)
-        if found
-        else full_view(height, width, shown)
-    )
+            pixels = _project(camera, np.asarray(K, np.float64))
+            found.append(np.clip(pixels, 0, [width - 1, height - 1]))
+    if not found:
+        return full_view(height, width, shown)
+    return close_up(np.concatenate(found), height, width, shown, margin=0.12)
 
 
 def list_axes() -> list[tuple[str, Color]]:
@@ -160,8 +148,8 @@ def draw_axes(
     pixels = _project(camera, K)
     for axis in np.argsort(-camera[1:, 2]):
         draw_lines(picture, [pixels[[0, axis + 1]]], AXES[axis], width)
-        draw_dots(picture, pixels[[axis + 1]], np.array([[0, 0, 0]]), width + 2)
-        draw_dots(picture, pixels[[axis + 1]], np.array([color]), width + 1)
+        draw_dots(picture, pixels[[axis + 1]], (0, 0, 0), width + 2)
+        draw_dots(picture, pixels[[axis + 1]], color, width + 1)
 
 
 def outline_object(
@@ -172,9 +160,8 @@ def outline_object(
     """
     if isinstance(shape, Mesh):
         view = View(-0.5, -0.5, 1 / coarse, -(-width // coarse), -(-height // coarse))
-        found = trace_outline(
-            render_silhouette(shape, pose, view.camera(K), view.height, view.width)
-        )
+        mask = render_silhouette(shape, pose, view.camera(K), view.height, view.width)
+        found = trace_outline(mask)
         if coarse > 1:  # straight edges are no stairs
             found = [cv2.approxPolyDP(line, 0.7, closed=True)[:, 0] for line in found]
         return [(line + 0.5) * coarse - 0.5 for line in found]

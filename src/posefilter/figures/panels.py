@@ -65,11 +65,9 @@ def draw_heat_panel(
     size = width - LEFT - RIGHT
     plot = cv2.resize(cells[::-1], (size, size), interpolation=cv2.INTER_NEAREST)
     if dots is not None and len(dots):
-        draw_dots(
-            plot, _locate(dots, x, y, size), np.tile(np.array([SURFACE]), (len(dots), 1)), 1.2
-        )
+        draw_dots(plot, _locate(dots, x, y, plot), SURFACE, 1.2)
     for mark in marks:
-        at = _locate(np.array([[mark.x, mark.y]]), x, y, size)[0]
+        at = _locate(np.array([[mark.x, mark.y]]), x, y, plot)[0]
         draw_mark(plot, np.clip(at, _REACH, size - 1 - _REACH), mark.color, mark.shape)
     return add_frame(plot, x, y)
 
@@ -90,14 +88,8 @@ def draw_curve_panel(
     """
     plot = _draw_rules(x, y, width, height)
     for values, color in lines:
-        path = _locate(
-            np.stack([places, np.clip(values, y.low, y.high)], 1),
-            x,
-            y,
-            plot.shape[1],
-            plot.shape[0],
-        )
-        draw_lines(plot, [path], color, thick, halo=False)
+        path = np.stack([places, np.clip(values, y.low, y.high)], 1)
+        draw_lines(plot, [_locate(path, x, y, plot)], color, thick, halo=False)
     return add_frame(plot, x, y)
 
 
@@ -114,20 +106,14 @@ def draw_histogram_panel(
     panel [px].
     """
     plot = _draw_rules(x, y, width, height)
-    corners = (
-        _locate(np.stack([edges, np.append(mass, 0)], 1), x, y, plot.shape[1], plot.shape[0])
-        .round()
-        .astype(int)
-    )
+    corners = _locate(np.stack([edges, np.append(mass, 0)], 1), x, y, plot).round().astype(int)
     for share, (left, top), right in zip(
         mass, corners[:-1].tolist(), corners[1:, 0].tolist(), strict=True
     ):
         if share > 0:
             plot[max(top, 0) :, left : max(right, left + 1)] = _MASS
     for value, color in marks:
-        (u, _), (_, low) = _locate(
-            np.array([[value, y.high], [value, y.low]]), x, y, plot.shape[1], plot.shape[0]
-        )
+        (u, _), (_, low) = _locate(np.array([[value, y.high], [value, y.low]]), x, y, plot)
         draw_lines(plot, [np.array([[u, 0], [u, low]])], color, 2)
     return add_frame(plot, x, y)
 
@@ -209,8 +195,8 @@ def draw_mark(
     )
 
 
-def _locate(places: np.ndarray, x: Axis, y: Axis, width: int, height: int = 0) -> np.ndarray:
-    """Return where places (P, 2) lie on a plot, a square one without a height.  -> (P, 2) [px]."""
+def _locate(places: np.ndarray, x: Axis, y: Axis, plot: np.ndarray) -> np.ndarray:
+    """Return where places (P, 2) lie on a plot.  -> (P, 2) [px]."""
     u = (places[:, 0] - x.low) / (x.high - x.low)
     v = (y.high - places[:, 1]) / (y.high - y.low)
-    return np.stack([u, v], 1) * [width - 1, (height or width) - 1]
+    return np.stack([u, v], 1) * [plot.shape[1] - 1, plot.shape[0] - 1]

@@ -15,6 +15,7 @@ from posefilter.figures.canvas import (
     arrange_grid,
     close_up,
     draw_dots,
+    draw_lines,
     full_view,
     halve,
 )
@@ -81,12 +82,8 @@ def draw_particles_on(
     if axes is not None:
         draw_many_axes(picture, fine.place(axes))
     order = np.argsort(weights, kind="stable")
-    draw_dots(
-        picture,
-        fine.place(pixels[order]),
-        color_by_weight(weights)[order],
-        max(3.0, fine.width / 200),
-    )
+    colors, radius = color_by_weight(weights)[order], max(3.0, fine.width / 200)
+    draw_dots(picture, fine.place(pixels[order]), colors, radius)
     return halve(picture)
 
 
@@ -99,10 +96,8 @@ def fade(rgb: np.ndarray, share: float) -> np.ndarray:
 def draw_many_axes(picture: np.ndarray, axes: np.ndarray, opacity: float = 0.6) -> None:
     """Draw the axes of several poses, half transparent, in place.  (M, 4, 2) [px]."""
     layer = picture.copy()
-    fixed = np.round(np.clip(axes, -16_000, 16_000) * 16).astype(np.int32)
     for k, color in enumerate(AXES, start=1):
-        lines = [np.ascontiguousarray(one) for one in fixed[:, [0, k]]]
-        cv2.polylines(layer, lines, False, color, 2, cv2.LINE_AA, 4)
+        draw_lines(layer, list(axes[:, [0, k]]), color, 2, halo=False)
     cv2.addWeighted(layer, opacity, picture, 1 - opacity, 0, picture)
 
 
@@ -118,12 +113,12 @@ def project_axes(
 
 
 def draw_iterations(
-    rgb: np.ndarray, K: np.ndarray, trace: Trace, image: int, space: Space, title: str = ""
+    rgb: np.ndarray, K: np.ndarray, trace: Trace, space: Space, title: str = ""
 ) -> np.ndarray:
     """Draw the particles of one image at several of the filter's steps, the first and the last
     included.
 
-    rgb (H, W, 3) uint8; K (3, 3) [px]; image: which of the trace's. Particles in pixel space are
+    rgb (H, W, 3) uint8; K (3, 3) [px]; trace: of the image alone. Particles in pixel space are
     dots, at eight steps. Those in pose space are dots at the object's center, with the axes of a
     few drawn by weight, at four steps: on the whole photograph, and beside it on a close-up of the
     object, since the last particles lie too close to be seen otherwise.
@@ -134,8 +129,7 @@ def draw_iterations(
     parts: list[np.ndarray] = []
     if isinstance(space, PoseSpace):
         steps = [
-            PoseStep(K, trace, image, number, space)
-            for number in choose_steps(len(trace.particles), 4)
+            PoseStep(K, trace, number, space) for number in choose_steps(len(trace.particles), 4)
         ]
         views = (frame, close_up(steps[-1].extent(), height, wide, width, margin=0.1))
         grounds = [draw_background(rgb, view) for view in views]
@@ -147,16 +141,12 @@ def draw_iterations(
         below, tiles = draw_background(rgb, frame), []
         for number in choose_steps(len(trace.particles), 8):
             particles = trace.particles[number]
-            state, weights = (
-                particles.state[image].detach().cpu().numpy(),
-                normalize_weights(particles, image).numpy(),
-            )
+            state = particles.state[0].detach().cpu().numpy()
             off = measure_off_frame(state, height, wide)
-            note = describe_effective(trace, image, number) + (
-                f", {off:.0%} off the frame" if off else ""
-            )
-            caption = f"step {number}: {describe_noise(trace, image, number, 'px')}"
-            picture = draw_particles_on(below, state, weights, frame)
+            beyond = f", {off:.0%} off the frame" if off else ""
+            note = describe_effective(particles) + beyond
+            caption = f"step {number}: {describe_noise(trace, number, 'px')}"
+            picture = draw_particles_on(below, state, normalize_weights(particles).numpy(), frame)
             tiles.append(add_caption(picture, caption, note=note))
         parts.append(arrange_grid(tiles, 2))
     return compose_figure(title or "Particles by iteration", *parts, draw_weight_scale())
@@ -167,28 +157,28 @@ def measure_off_frame(pixels: np.ndarray, height: int, width: int) -> float:
     return float(((pixels < -0.5) | (pixels > [width - 0.5, height - 0.5])).any(1).mean())
 
 
-def describe_step(trace: Trace, image: int, number: int, unit: str) -> str:
+def describe_step(trace: Trace, number: int, unit: str) -> str:
     """Tell which step it is, its noise level, and how many particles are effective."""
-    noise = describe_noise(trace, image, number, unit)
-    return f"step {number}: {noise}, {describe_effective(trace, image, number)}"
+    noise = describe_noise(trace, number, unit)
+    return f"step {number}: {noise}, {describe_effective(trace.particles[number])}"
 
 
-def describe_noise(trace: Trace, image: int, number: int, unit: str) -> str:
+def describe_noise(trace: Trace, number: int, unit: str) -> str:
     """Tell a step's noise level, in mm of what is kept in meters, or in px."""
     sigma = trace.steps[number].sigma
-    level = float(sigma if sigma.ndim == 0 else sigma[image]) * (1000 if unit == "mm" else 1)
+    level = float(sigma.reshape(-1)[0]) * (1000 if unit == "mm" else 1)
     return f"noise {level:.3g} {unit}"
 
 
-def describe_effective(trace: Trace, image: int, number: int) -> str:
-    """Tell the effective share of a step's particles."""
-    weights = normalize_weights(trace.particles[number], image)
+def describe_effective(particles: Particles) -> str:
+    """Tell the effective share of one image's particles."""
+    weights = normalize_weights(particles)
     return f"{float(1 / weights.square().sum() / len(weights)):.0%} effective"
 
 
-def normalize_weights(particles: Particles, image: int) -> torch.Tensor:
+def normalize_weights(particles: Particles) -> torch.Tensor:
     """Return one image's weights, summing to 1.  -> (N,) float64."""
-    return torch.softmax(particles.log_weights[image].detach().cpu().double(), 0)
+    return torch.softmax(particles.log_weights[0].detach().cpu().double(), 0)
 
 
 def choose_steps(count: int, max_steps: int) -> list[int]:
@@ -201,24 +191,18 @@ def choose_steps(count: int, max_steps: int) -> list[int]:
 class PoseStep:
     """One step of a filter whose particles are poses, projected."""
 
-    def __init__(
-        self, K: np.ndarray, trace: Trace, image: int, number: int, space: PoseSpace
-    ) -> None:
+    def __init__(self, K: np.ndarray, trace: Trace, number: int, space: PoseSpace) -> None:
         camera = torch.as_tensor(np.asarray(K), dtype=torch.float64)
         center = torch.tensor(space.center, dtype=torch.float64)
-        poses = trace.outputs[number].pose[image].detach().cpu().double()
-        weights = normalize_weights(trace.particles[number], image)
+        poses = trace.outputs[number].pose[0].detach().cpu().double()
+        weights = normalize_weights(trace.particles[number])
         self.weights = weights.numpy()
-        self.pixels = project(origin_of(poses, center), camera).numpy()
-        self.axes = project_axes(
-            poses[choose_by_weight(weights, 24)], center, 0.6 * space.radius, camera
-        )
-        self.half_side = (
-            space.radius
-            * float(camera[0, 0])
-            / max(float(weights @ origin_of(poses, center)[:, 2]), 0.05)
-        )
-        self.caption = describe_step(trace, image, number, "mm")
+        centers, few = origin_of(poses, center), poses[choose_by_weight(weights, 24)]
+        self.pixels = project(centers, camera).numpy()
+        self.axes = project_axes(few, center, 0.6 * space.radius, camera)
+        away = max(float(weights @ centers[:, 2]), 0.05)
+        self.half_side = space.radius * float(camera[0, 0]) / away
+        self.caption = describe_step(trace, number, "mm")
 
     def extent(self) -> np.ndarray:
         """Return two corners that hold the object, as the mean of the particles has it.  -> (2, 2)

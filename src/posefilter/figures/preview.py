@@ -56,15 +56,9 @@ def draw_frame(sample: Sample, name: str, near: float, far: float) -> np.ndarray
     share = (np.clip(sample.depth, near, far) - near) / max(far - near, 1e-9)
     depth = (_DEPTH(share)[..., :3] * 255).astype(np.uint8)
     depth[sample.depth <= 0] = _UNKNOWN
+    depth = cv2.resize(depth, size, interpolation=cv2.INTER_NEAREST)
     gap = np.full((4, _TILE, 3), PAPER, np.uint8)
-    return np.concatenate(
-        [
-            draw_row(_TILE, name, size=14),
-            photo,
-            gap,
-            cv2.resize(depth, size, interpolation=cv2.INTER_NEAREST),
-        ]
-    )
+    return np.concatenate([draw_row(_TILE, name, size=14), photo, gap, depth])
 
 
 def draw_depth_scale(width: int, near: float, far: float) -> np.ndarray:

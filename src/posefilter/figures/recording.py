@@ -12,7 +12,7 @@ import torch
 from posefilter.errors import missing_package
 from posefilter.figures.canvas import AXES, ESTIMATE
 from posefilter.figures.particles import choose_by_weight, color_by_weight
-from posefilter.figures.view_data import Hypothesis, Moment, ViewData
+from posefilter.figures.view_data import Cloud, Hypothesis, Moment, ViewData
 from posefilter.meshes.mesh import Mesh
 
 TIMELINE = "step"
@@ -37,11 +37,7 @@ def record(shown: ViewData, path: Path) -> None:
     the library is missing.
     """
     check_viewer()
-    rr: Any = importlib.import_module("rerun")
-    stream = rr.RecordingStream("posefilter")
-    stream.set_log_time_enabled(False)
-    stream.set_log_tick_enabled(False)
-    stream.save(path, default_blueprint=_layout(shown))
+    rr, stream = open_stream("posefilter", path, _layout(shown))
     stream.send_recording_name(shown.name)
     _log_scene(rr, stream, shown)
     for number, moment in enumerate(shown.moments):
@@ -58,27 +54,26 @@ def record(shown: ViewData, path: Path) -> None:
     stream.disconnect()
 
 
+def open_stream(name: str, path: Path, layout: Any) -> tuple[Any, Any]:
+    """Return the library, and a recording that it writes to a file, in the camera's frame."""
+    rr: Any = importlib.import_module("rerun")
+    stream = rr.RecordingStream(name)
+    stream.set_log_time_enabled(False)
+    stream.set_log_tick_enabled(False)
+    stream.save(path, default_blueprint=layout)
+    stream.log("/", rr.ViewCoordinates.RDF, static=True)
+    return rr, stream
+
+
 def _log_scene(rr: Any, stream: Any, shown: ViewData) -> None:
     """Log what does not change: the photograph and its camera, the cloud, the estimate's box, and
     what it all is.
     """
-    height, width = shown.rgb.shape[:2]
-    stream.log("/", rr.ViewCoordinates.RDF, static=True)
-    camera = rr.Pinhole(
-        image_from_camera=shift_to_corners(shown.K),
-        resolution=[width, height],
-        image_plane_distance=0.1,
-    )
+    camera = make_camera(rr, shown.K, *shown.rgb.shape[:2])
     stream.log("photograph", camera, rr.Image(shown.rgb, color_model="RGB"), static=True)
-    stream.log(
-        "cloud",
-        rr.Points3D(shown.points, colors=shown.colors, radii=0.6 * shown.footprints),
-        static=True,
-    )
-    low, high = shown.mesh.bounds
-    size = {"centers": [(low + high) / 2], "half_sizes": [(high - low) / 2]}
-    box = rr.Boxes3D(**size, colors=[ESTIMATE], fill_mode="majorwireframe")
-    stream.log("estimate_box", _placed(rr, shown.estimate.pose), box, static=True)
+    stream.log("cloud", make_dots(rr, shown.cloud), static=True)
+    placed, box = make_transform(rr, shown.estimate.pose), make_box(rr, shown.mesh)
+    stream.log("estimate_box", placed, box, static=True)
     stream.log("about", rr.TextDocument(describe(shown), media_type="text/markdown"), static=True)
     stream.log("filter/noise", rr.SeriesLines(names=[f"noise level [{shown.unit}]"]), static=True)
     stream.log("filter/effective", rr.SeriesLines(names=["effective sample size [%]"]), static=True)
@@ -124,7 +119,7 @@ def _log_hypothesis(
     color: tuple[int, int, int],
 ) -> None:
     """Log the mesh where a hypothesis puts it, with its weight."""
-    stream.log(entity, _placed(rr, one.pose), mesh, rr.AnyValues(weight=one.weight))
+    stream.log(entity, make_transform(rr, one.pose), mesh, rr.AnyValues(weight=one.weight))
     text = f"{entity.replace('modes/', 'mode ')}: {one.weight:.0%} of the belief"
     label = rr.Points3D(
         [shown.center], labels=[text], colors=[color], radii=[shown.radius / 100], show_labels=True
@@ -132,8 +127,29 @@ def _log_hypothesis(
     stream.log(f"{entity}/weight", label)
 
 
-def _placed(rr: Any, pose: np.ndarray) -> Any:
+def make_transform(rr: Any, pose: np.ndarray) -> Any:
+    """Return a pose (4, 4) as the viewer takes it."""
     return rr.Transform3D(translation=pose[:3, 3], mat3x3=pose[:3, :3])
+
+
+def make_camera(rr: Any, K: np.ndarray, height: int, width: int) -> Any:
+    """Return a camera; its pixels' corners, not their centers, have integer coordinates there."""
+    corners = np.array(K, np.float64)
+    corners[:2, 2] += 0.5
+    size = [width, height]
+    return rr.Pinhole(image_from_camera=corners, resolution=size, image_plane_distance=0.1)
+
+
+def make_dots(rr: Any, cloud: Cloud) -> Any:
+    """Return a cloud of points that touch each other."""
+    return rr.Points3D(cloud.points, colors=cloud.colors, radii=0.6 * cloud.footprints)
+
+
+def make_box(rr: Any, mesh: Mesh, **more: Any) -> Any:
+    """Return the box round a mesh."""
+    low, high = mesh.bounds
+    size = {"centers": [(low + high) / 2], "half_sizes": [(high - low) / 2]}
+    return rr.Boxes3D(**size, colors=[ESTIMATE], fill_mode="majorwireframe", **more)
 
 
 def make_textured(rr: Any, mesh: Mesh) -> Any:
@@ -170,15 +186,6 @@ def make_faint(rr: Any, mesh: Mesh) -> Any:
         vertex_normals=normals,
         albedo_factor=[*_OTHER, _FAINT],
     )
-
-
-def shift_to_corners(K: np.ndarray) -> np.ndarray:
-    """Return the camera matrix for pixels whose corners, not their centers, have integer
-    coordinates.  (3, 3) [px].
-    """
-    out = np.array(K, np.float64)
-    out[:2, 2] += 0.5
-    return out
 
 
 def describe(shown: ViewData) -> str:

@@ -66,9 +66,8 @@ def compute_coverage(pixels: np.ndarray, weights: np.ndarray, view: View) -> np.
     total = np.zeros((view.height, view.width), np.float32)
     for one, weight in zip(pixels, weights, strict=True):
         if np.isfinite(one).all():
-            corners = cv2.convexHull(
-                np.round(view.place(one)).clip(-16_000, 16_000).astype(np.int32)
-            )
+            placed = np.round(view.place(one)).clip(-16_000, 16_000).astype(np.int32)
+            corners = cv2.convexHull(placed)
             (left, top), (right, bottom) = corners.min((0, 1)).clip(0), corners.max((0, 1)) + 1
             # no more of the picture is looked at than the silhouette needs
             part = total[top:bottom, left:right]
@@ -97,7 +96,7 @@ def draw_silhouettes(
     grounds = [fade(view.show(rgb), 0.6) for view in (frame, near)]
     parts: list[np.ndarray] = []
     for number in choose_steps(len(trace.particles), 4):
-        weights = normalize_weights(trace.particles[number], 0)
+        weights = normalize_weights(trace.particles[number])
         poses = trace.outputs[number].pose[0].detach().cpu().double()
         chosen = poses[choose_by_weight(weights, 64)]
         pixels = project_hulls(chosen, hull, K)
@@ -108,7 +107,7 @@ def draw_silhouettes(
             view.outline(picture, outline_hulls(pixels[::4]), _LINE, 1, halo=False)
             view.outline(picture, outline_hulls(true), TRUTH, 2)
             tiles.append(picture)
-        parts += [draw_text(describe_step(trace, 0, number, "mm"), CAPTION), arrange_grid(tiles, 2)]
+        parts += [draw_text(describe_step(trace, number, "mm"), CAPTION), arrange_grid(tiles, 2)]
     foot = [
         draw_legend([("truth", TRUTH), ("16 outlines", _LINE)]),
         draw_color_scale("weight: 0", "1", "plasma"),

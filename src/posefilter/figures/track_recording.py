@@ -6,13 +6,19 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-import torch
 
 from posefilter.figures.canvas import ESTIMATE
 from posefilter.figures.overlay import Shape
-from posefilter.figures.recording import check_viewer, make_textured, shift_to_corners
-from posefilter.figures.view_data import make_mesh
-from posefilter.geometry.camera import back_project, pixel_grid
+from posefilter.figures.recording import (
+    check_viewer,
+    make_box,
+    make_camera,
+    make_dots,
+    make_textured,
+    make_transform,
+    open_stream,
+)
+from posefilter.figures.view_data import make_cloud, make_mesh
 
 TIMELINE = "frame"
 _EVERY = 4  # [px] between the cloud's points: a video has many frames
@@ -56,12 +62,7 @@ class TrackRecorder:
     def __enter__(self) -> "TrackRecorder":
         """Open the file."""
         if self.path is not None:
-            self._rr = importlib.import_module("rerun")
-            self._stream = self._rr.RecordingStream("posefilter tracks")
-            self._stream.set_log_time_enabled(False)
-            self._stream.set_log_tick_enabled(False)
-            self._stream.save(self.path, default_blueprint=_layout())
-            self._stream.log("/", self._rr.ViewCoordinates.RDF, static=True)
+            self._rr, self._stream = open_stream("posefilter tracks", self.path, _layout())
         return self
 
     def add(self, rgb: np.ndarray, depth: np.ndarray, K: np.ndarray, seen: Sequence[Seen]) -> None:
@@ -78,16 +79,9 @@ class TrackRecorder:
         rr, stream = self._rr, self._stream
         stream.set_time(TIMELINE, sequence=self._number)
         self._number += 1
-        height, width = depth.shape
-        camera = rr.Pinhole(
-            image_from_camera=shift_to_corners(K),
-            resolution=[width, height],
-            image_plane_distance=0.1,
-        )
         photograph = rr.Image(rgb, color_model="RGB").compress(jpeg_quality=_QUALITY)
-        stream.log("photograph", camera, photograph)
-        points, colors, footprints = thin_cloud(rgb, depth, K)
-        stream.log("cloud", rr.Points3D(points, colors=colors, radii=0.6 * footprints))
+        stream.log("photograph", make_camera(rr, K, *depth.shape), photograph)
+        stream.log("cloud", make_dots(rr, make_cloud(rgb, depth, K, _EVERY)))
         for one in seen:
             self._add_object(one)
 
@@ -102,15 +96,11 @@ class TrackRecorder:
             self._shown.discard(name)
             self._trails.pop(name, None)
             return
-        placed = rr.Transform3D(translation=one.pose[:3, 3], mat3x3=one.pose[:3, :3])
-        stream.log(f"objects/{name}", placed)
+        stream.log(f"objects/{name}", make_transform(rr, one.pose))
         if name not in self._shown:
             mesh = make_mesh(self._shapes[name], name)
             stream.log(f"objects/{name}", make_textured(rr, mesh))
-            low, high = mesh.bounds
-            size = {"centers": [(low + high) / 2], "half_sizes": [(high - low) / 2]}
-            box = rr.Boxes3D(**size, colors=[ESTIMATE], labels=[name], fill_mode="majorwireframe")
-            stream.log(f"objects/{name}/box", box)
+            stream.log(f"objects/{name}/box", make_box(rr, mesh, labels=[name]))
             self._shown.add(name)
         trail = self._trails.setdefault(name, [])
         trail.append(one.pose[:3, :3] @ one.center + one.pose[:3, 3])
@@ -123,27 +113,6 @@ class TrackRecorder:
         if self._stream is not None:
             self._stream.flush()
             self._stream.disconnect()
-
-
-def thin_cloud(
-    rgb: np.ndarray, depth: np.ndarray, K: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Back-project some of the pixels whose depth is known.
-
-    Args:
-        rgb: (H, W, 3) uint8.
-        depth: (H, W) [m].
-        K: (3, 3) [px].
-
-    Returns:
-        Points (P, 3) [m], their colors (P, 3) and the distances between neighbors (P,) [m].
-    """
-    z = np.where(np.isfinite(depth), depth, 0)[::_EVERY, ::_EVERY]
-    known = z > 0
-    pixels = pixel_grid(*depth.shape)[::_EVERY, ::_EVERY].double()[torch.from_numpy(known)]
-    away = torch.from_numpy(z[known]).double()
-    points = back_project(pixels, away, torch.from_numpy(np.asarray(K, np.float64))).numpy()
-    return points, rgb[::_EVERY, ::_EVERY][known], _EVERY * points[:, 2] / float(K[0, 0])
 
 
 def _layout() -> Any:

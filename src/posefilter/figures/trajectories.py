@@ -22,11 +22,8 @@ _NUMBER = 40  # [px] where a row's number stands
 def find_hits(mask: np.ndarray, pixels: np.ndarray) -> np.ndarray:
     """Tell which particles stand on a mask.  (H, W) bool, (*, 2) [px] -> (*) bool."""
     places = torch.from_numpy(np.asarray(pixels, np.float32).reshape(1, -1, 2))
-    return (
-        overlaps_mask(torch.from_numpy(mask)[None, None], places)[0]
-        .numpy()
-        .reshape(pixels.shape[:-1])
-    )
+    hits = overlaps_mask(torch.from_numpy(mask)[None, None], places)[0]
+    return hits.numpy().reshape(pixels.shape[:-1])
 
 
 def draw_trajectories(
@@ -41,19 +38,16 @@ def draw_trajectories(
     H, W = mask.shape
     path = states[:, :max_particles]
     on = find_hits(mask, path[-1])
-    left = bool(((path < -0.5) | (path > [W - 0.5, H - 0.5])).any())
-    view = (
-        View(-0.5 - W / 2, -0.5 - H / 2, WIDTH / (2 * W), WIDTH, round(WIDTH * H / W))
-        if left
-        else full_view(H, W, WIDTH)
-    )
+    view = full_view(H, W, WIDTH)
+    if ((path < -0.5) | (path > [W - 0.5, H - 0.5])).any():
+        view = View(-0.5 - W / 2, -0.5 - H / 2, WIDTH / (2 * W), WIDTH, round(WIDTH * H / W))
     picture = view.show(rgb)
     view.outline(picture, trace_outline(mask), (255, 255, 255), 1)
     for end, color in ((False, OFF), (True, ON)):
         chosen = view.place(path[:, on == end])
         draw_lines(picture, list(chosen.transpose(1, 0, 2)), color, 1, halo=False)
-        draw_dots(picture, chosen[0], np.tile(np.array([START]), (chosen.shape[1], 1)), 2)
-        draw_dots(picture, chosen[-1], np.tile(np.array([color]), (chosen.shape[1], 1)), 3.5)
+        draw_dots(picture, chosen[0], START, 2)
+        draw_dots(picture, chosen[-1], color, 3.5)
     note = f"{len(states)} steps: {on.mean():.0%} end on the object"
     return compose_figure(
         title, draw_text(note, CAPTION), picture, draw_legend([("start", START), *_ENDS])
@@ -83,26 +77,15 @@ def draw_glimpses(
         way = view.place(states[:, i])
         draw_lines(picture, [way], TRUTH if on[-1, i] else OFF, 2)
         draw_dots(picture, way, np.array([ON if hit else OFF for hit in on[:, i]]), 4)
-        draw_dots(picture, way[:1], np.array([START]), 4)
+        draw_dots(picture, way[:1], START, 4)
         draw_label(picture, str(i + 1), way[-1])
     shown = choose_steps(len(states), max_steps)
     size = min(90, (WIDTH - _NUMBER) // len(shown))
-    rows = [
-        arrange_row(
-            [
-                draw_text("", CAPTION, _NUMBER),
-                *(draw_text(f"step {t}", DETAIL, size) for t in shown),
-            ]
-        )
-    ]
+    heads = [draw_text(f"step {t}", DETAIL, size) for t in shown]
+    rows = [arrange_row([draw_text("", CAPTION, _NUMBER), *heads])]
     for i in range(n):
-        cells = [
-            np.pad(
-                draw_text(str(i + 1), CAPTION, _NUMBER),
-                ((size // 5, 0), (0, 0), (0, 0)),
-                constant_values=255,
-            )
-        ]
+        number = draw_text(str(i + 1), CAPTION, _NUMBER)
+        cells = [np.pad(number, ((size // 5, 0), (0, 0), (0, 0)), constant_values=255)]
         for t in shown:
             cell = np.full((size, size, 3), 255, np.uint8)
             cell[2:-2, 2:-2] = ON if on[t, i] else OFF

@@ -46,15 +46,21 @@ class Hypothesis(NamedTuple):
     weight: float  # share of the belief's weight
 
 
+class Cloud(NamedTuple):
+    """Pixels whose depth is known, as points."""
+
+    points: np.ndarray  # (P, 3) back-projected [m]
+    colors: np.ndarray  # (P, 3) uint8
+    footprints: np.ndarray  # (P,) distance between neighbors at that depth [m]
+
+
 class ViewData(NamedTuple):
     """All that is shown of one image."""
 
     name: str  # of the object
     rgb: np.ndarray  # (H, W, 3) uint8, as the filter saw it
     K: np.ndarray  # (3, 3) [px], pixel centers at integers
-    points: np.ndarray  # (P, 3) the pixels whose depth is known, back-projected [m]
-    colors: np.ndarray  # (P, 3) uint8
-    footprints: np.ndarray  # (P,) size of a pixel at that depth [m]
+    cloud: Cloud
     mesh: Mesh
     center: np.ndarray  # (3,) of the object, in its own frame [m]
     radius: float  # of the object [m]
@@ -79,7 +85,7 @@ def collect_view_data(
     """
     K = batch.intrinsics[image].detach().cpu().double()
     center = object_model.center.detach().cpu().double()
-    points, colors = color_points(batch.rgb[image], batch.depth[image], batch.intrinsics[image])
+    rgb, depth = to_image(batch.rgb[image]), batch.depth[image, 0].detach().cpu().numpy()
     belief = trace.belief
     poses, best = (x[image].detach().cpu().double() for x in (belief.poses, belief.best))
     estimate, others, left_out, *_ = find_hypotheses(
@@ -99,11 +105,9 @@ def collect_view_data(
     )
     return ViewData(
         name=object_model.name,
-        rgb=to_image(batch.rgb[image]),
+        rgb=rgb,
         K=K.numpy(),
-        points=points,
-        colors=colors,
-        footprints=points[:, 2] / float(K[0, 0]),
+        cloud=make_cloud(rgb, depth, K.numpy()),
         mesh=make_mesh(shape, object_model.name),
         center=center.numpy(),
         radius=object_model.radius,
@@ -136,17 +140,21 @@ def make_moment(
     return Moment(poses.numpy(), centers.numpy(), at.numpy(), weights.numpy(), effective, sigma)
 
 
-def color_points(rgb: Tensor, depth: Tensor, K: Tensor) -> tuple[np.ndarray, np.ndarray]:
+def make_cloud(rgb: np.ndarray, depth: np.ndarray, K: np.ndarray, every: int = 1) -> Cloud:
     """Back-project the pixels whose depth is known.
 
-    (3, H, W), (1, H, W) [m], (3, 3) -> (P, 3) [m], (P, 3) uint8.
+    Args:
+        rgb: (H, W, 3) uint8.
+        depth: (H, W) [m].
+        K: (3, 3) [px].
+        every: Only each so many-th row and column.
     """
-    z = depth[0].detach().cpu().double()
+    z = np.where(np.isfinite(depth), depth, 0)[::every, ::every]
     known = z > 0
-    pixels = pixel_grid(*z.shape).double()[known]
-    return back_project(pixels, z[known], K.detach().cpu().double()).numpy(), to_image(rgb)[
-        known.numpy()
-    ]
+    pixels = pixel_grid(*depth.shape)[::every, ::every].double()[torch.from_numpy(known)]
+    away = torch.from_numpy(z[known]).double()
+    points = back_project(pixels, away, torch.from_numpy(np.asarray(K, np.float64))).numpy()
+    return Cloud(points, rgb[::every, ::every][known], every * points[:, 2] / float(K[0, 0]))
 
 
 class Hypotheses(NamedTuple):

@@ -9,12 +9,12 @@ from typing import Any
 
 import torch
 from torch import Tensor
-from torchmetrics.utilities.data import dim_zero_cat
 
 from posefilter.geometry.camera import project
 from posefilter.geometry.pose import transform
 from posefilter.geometry.symmetries import densify
-from posefilter.metrics.collect import Rows
+from posefilter.metrics.collect import Rows, concat_state
+from posefilter.metrics.scores import median
 from posefilter.types import ObjectModel
 
 # shares of the diameter, and pixels in an image 640 wide, below which an error counts as correct
@@ -144,19 +144,14 @@ class BopErrors(Rows):
         """Return {"mssd": {"ar", "median_mm"}, "mspd": {"ar", "median_px"}}, average recalls in [0,
         100]; pixels are those of an image 640 wide.
         """
-        rows = dim_zero_cat(self.rows) if len(self.rows) else torch.zeros(0, 3)
-        surface, pixels, diameter = rows.unbind(1)
-        middle = torch.tensor([torch.nan, torch.nan])
-        if len(rows):
-            ordered = rows[:, :2].sort(0).values
-            middle = ordered[[(len(rows) - 1) // 2, len(rows) // 2]].mean(0)
+        surface, pixels, diameter = concat_state(self.rows).reshape(-1, 3).T
         return {
             "mssd": {
                 "ar": average_recall(surface, MSSD_THRESHOLDS, diameter),
-                "median_mm": float(1000 * middle[0]),
+                "median_mm": 1000 * median(surface),
             },
             "mspd": {
                 "ar": average_recall(pixels, MSPD_THRESHOLDS, torch.ones_like(pixels)),
-                "median_px": float(middle[1]),
+                "median_px": median(pixels),
             },
         }

@@ -13,7 +13,7 @@ from posefilter.geometry.pose_error import subsample
 from posefilter.geometry.spaces import PoseSpace
 from posefilter.metrics.beliefs import entropy, mass_within, on_object, rank_of_truth, spread
 from posefilter.metrics.errors import NearestPoint, add, add_s
-from posefilter.metrics.scores import summarize
+from posefilter.metrics.scores import summarize_rows
 from posefilter.types import BeliefBatch, ObjectModel
 
 
@@ -33,26 +33,21 @@ class Rows(Metric):
         self.add_state("rows", default=[], dist_reduce_fx="cat")
 
 
-class PoseErrors(Metric):
+class PoseErrors(Rows):
     """ADD and ADD-S of all instances; missed ones and poses that are not finite have infinite
     error.
+
+    A row is ADD, ADD-S and the object's diameter [m].
 
     Args:
         models: The objects.
         **kwargs: Arguments of torchmetrics.Metric.
     """
 
-    full_state_update = False
-    add: list[Tensor]
-    add_s: list[Tensor]
-    diameter: list[Tensor]
-
     def __init__(self, models: Sequence[ObjectModel], **kwargs: Any) -> None:
         super().__init__(**kwargs)
         self.models = list(models)
         self.trees = [NearestPoint(model.points) for model in models]
-        for name in ("add", "add_s", "diameter"):
-            self.add_state(name, default=[], dist_reduce_fx="cat")
 
     def update(self, poses: Tensor, truth: Tensor, object_id: Tensor | None = None) -> None:
         """Accumulate errors, in the order of the instances.
@@ -64,26 +59,21 @@ class PoseErrors(Metric):
         """
         ids = [0] * len(truth) if object_id is None else object_id.tolist()
         good = poses.isfinite().flatten(1).all(1)
-        errors = torch.full((3, len(truth)), torch.inf, dtype=torch.float64, device=truth.device)
+        rows = torch.full((len(truth), 3), torch.inf, dtype=torch.float64, device=truth.device)
         for index in sorted(set(ids)):
             selected = torch.tensor([i == index for i in ids], device=truth.device)
             model, tree = self.models[index], self.trees[index]
             a, b = poses[selected & good].double(), truth[selected & good].double()
-            errors[0, selected & good] = add(a, b, model.points)
-            errors[1, selected & good] = add_s(a, b, tree)
-            errors[2, selected] = model.diameter
-        for state, values in zip((self.add, self.add_s, self.diameter), errors, strict=True):
-            state.append(values)
+            rows[selected & good, 0] = add(a, b, model.points)
+            rows[selected & good, 1] = add_s(a, b, tree)
+            rows[selected, 2] = model.diameter
+        self.rows.append(rows)
 
     def compute(self) -> dict[str, Any]:
         """Return {"instances", "missed", "add": {...}, "add_s": {...}} as in metrics.json."""
-        errors, diameter = concat_state(self.add), concat_state(self.diameter)
-        return {
-            "instances": len(errors),
-            "missed": int(errors.isinf().sum()),
-            "add": summarize(errors, diameter),
-            "add_s": summarize(concat_state(self.add_s), diameter),
-        }
+        rows = concat_state(self.rows).reshape(-1, 3)
+        missed = int(rows[:, 0].isinf().sum())
+        return {"instances": len(rows), "missed": missed, **summarize_rows(rows)}
 
 
 class Average(Metric):
@@ -136,7 +126,7 @@ class BeliefQuality(Rows):
     0.9 (50 and 90 if calibrated, less if overconfident); of highest-density sets see `Credibility`.
 
     Args:
-        models: The objects.
+        object_model: The object.
         points: Number of points of ADD.
         **kwargs: Arguments of torchmetrics.Metric.
     """
@@ -151,35 +141,23 @@ class BeliefQuality(Rows):
         "rank",
     )
 
-    def __init__(self, models: Sequence[ObjectModel], points: int = 256, **kwargs: Any) -> None:
+    def __init__(self, object_model: ObjectModel, points: int = 256, **kwargs: Any) -> None:
         super().__init__(**kwargs)
-        self.models = list(models)
-        self.points = [subsample(model.points, points) for model in models]
+        self.space = PoseSpace(tuple(object_model.center.tolist()), object_model.radius)
+        self.distances = (0.1 * object_model.diameter, 0.02)
+        self.points = subsample(object_model.points, points)
 
-    def update(self, belief: BeliefBatch, truth: Tensor, object_id: Tensor | None = None) -> None:
-        """Accumulate beliefs.
-
-        Args:
-            belief: B beliefs.
-            truth: (B, 4, 4) true poses.
-            object_id: (B,) index into `models`; the only one if None.
-        """
-        ids = torch.zeros(len(truth), dtype=torch.int64) if object_id is None else object_id
-        for index in ids.unique().tolist():
-            selected = (ids == index).to(truth.device)
-            model, points = self.models[index], self.points[index]
-            distances = (0.1 * model.diameter, 0.02)
-            space = PoseSpace(tuple(model.center.tolist()), model.radius)
-            poses, log_w = belief.poses[selected], belief.log_weights[selected]
-            target = truth[selected]
-            values = [
-                entropy(log_w),
-                1 / log_w.exp().square().sum(1),
-                *spread(poses, log_w, space),
-                *(mass_within(poses, log_w, target, points, d) for d in distances),
-                rank_of_truth(poses, log_w, target, space),
-            ]
-            self.rows.append(torch.stack(values, dim=1).double())
+    def update(self, belief: BeliefBatch, truth: Tensor) -> None:
+        """Accumulate B beliefs, with the true poses (B, 4, 4)."""
+        poses, log_w = belief.poses, belief.log_weights
+        values = [
+            entropy(log_w),
+            1 / log_w.exp().square().sum(1),
+            *spread(poses, log_w, self.space),
+            *(mass_within(poses, log_w, truth, self.points, d) for d in self.distances),
+            rank_of_truth(poses, log_w, truth, self.space),
+        ]
+        self.rows.append(torch.stack(values, dim=1).double())
 
     def compute(self) -> dict[str, float]:
         """Return the mean of each metric; empty without images."""

@@ -70,11 +70,6 @@ def is_off_frame(state: Tensor, width: int, height: int) -> Tensor:
     return (u < -0.5) | (u > width - 0.5) | (v < -0.5) | (v > height - 0.5)
 
 
-def off_frame(state: Tensor, width: int, height: int) -> Tensor:
-    """Return the share of particles off the frame.  (B, N, 2) [px] -> (B,)."""
-    return is_off_frame(state, width, height).float().mean(1)
-
-
 def near_edge(state: Tensor, width: int, height: int, share: float = 0.05) -> tuple[Tensor, Tensor]:
     """Return the shares of particles near an edge and near a corner of the frame.
 
@@ -148,7 +143,7 @@ class FilterDiagnostics(Metric):
         for particles, output in zip(trace.particles, trace.outputs, strict=True):
             edge, corner = near_edge(particles.state, width, height)
             on = on_object(batch.mask, particles.state)
-            off = off_frame(particles.state, width, height)
+            off = is_off_frame(particles.state, width, height).float().mean(1)
             steps.append(torch.stack([on, off, edge, corner, distinct(particles.state)]))
             lines.append(line_share(particles.state))
             self.cosine.append(pairwise_cosine(output.displacement))

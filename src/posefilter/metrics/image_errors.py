@@ -10,7 +10,7 @@ import torch
 
 from posefilter.files import open_whole_text
 from posefilter.forms import MOST
-from posefilter.metrics.scores import summarize
+from posefilter.metrics.scores import summarize_rows
 
 FILE = "errors.csv"
 
@@ -51,7 +51,7 @@ def read_errors(path: Path) -> list[ImageError]:
         ValueError: Where a row is malformed.
     """
     try:
-        with path.open(newline="") as file:
+        with path.open(newline="", encoding="utf-8") as file:
             return [parse_row(row) for row in csv.DictReader(file)]
     except csv.Error as error:
         raise ValueError(str(error)) from error
@@ -78,9 +78,5 @@ def parse_row(row: dict[str, str]) -> ImageError:
 
 def summarize_errors(rows: Sequence[ImageError]) -> dict[str, dict[str, float]]:
     """Return the blocks `add` and `add_s` of metrics.json for a set of images."""
-    diameter = torch.tensor([row.diameter_mm for row in rows], dtype=torch.float64) / 1000
-    errors = {
-        "add": torch.tensor([row.add_mm for row in rows], dtype=torch.float64) / 1000,
-        "add_s": torch.tensor([row.add_s_mm for row in rows], dtype=torch.float64) / 1000,
-    }
-    return {name: summarize(own, diameter) for name, own in errors.items()}
+    numbers = [(row.add_mm, row.add_s_mm, row.diameter_mm) for row in rows]
+    return summarize_rows(torch.tensor(numbers, dtype=torch.float64).reshape(-1, 3) / 1000)

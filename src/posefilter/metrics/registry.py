@@ -85,56 +85,71 @@ def _signed_unit(key: str, label: str, direction: int, short: str) -> MetricInfo
     return MetricInfo(key, label, "", ".2f", direction, 1.0, SIGNED_UNIT, short)
 
 
+def _count(
+    key: str, label: str, direction: int = NEITHER, short: str = "", meaning: str = ""
+) -> MetricInfo:
+    """Return a metric that is a whole number."""
+    return MetricInfo(key, label, form=".0f", direction=direction, short=short, meaning=meaning)
+
+
+def _percent(
+    key: str, label: str, form: str, direction: int, short: str = "", meaning: str = ""
+) -> MetricInfo:
+    """Return a metric that is stored in percent."""
+    return MetricInfo(key, label, "%", form, direction, 1.0, PERCENT, short, meaning)
+
+
 def _describe_errors(name: str, label: str) -> tuple[MetricInfo, ...]:
     return (
         MetricInfo(f"{name}/auc", f"{label} AUC", "", ".1f", HIGHER, limits=PERCENT),
-        MetricInfo(
-            f"{name}/recall_01d",
-            f"{label} < 0.1 diameter",
-            "%",
-            ".1f",
-            HIGHER,
-            limits=PERCENT,
-            short=f"{label} < 0.1 d",
+        _percent(
+            f"{name}/recall_01d", f"{label} < 0.1 diameter", ".1f", HIGHER, f"{label} < 0.1 d"
         ),
-        MetricInfo(f"{name}/recall_2cm", f"{label} < 2 cm", "%", ".1f", HIGHER, limits=PERCENT),
+        _percent(f"{name}/recall_2cm", f"{label} < 2 cm", ".1f", HIGHER),
         MetricInfo(f"{name}/median_mm", f"median {label}", "mm", ".1f", LOWER),
     )
 
 
 def _describe_bop(name: str, unit: str, thresholds: str) -> tuple[MetricInfo, ...]:
     label, meaning = name.upper(), f"over thresholds of {thresholds}"
-    recall = f"{label} average recall"
     return (
-        MetricInfo(f"{name}/ar", recall, "%", ".1f", HIGHER, limits=PERCENT, meaning=meaning),
+        _percent(f"{name}/ar", f"{label} average recall", ".1f", HIGHER, meaning=meaning),
         MetricInfo(f"{name}/median_{unit}", f"median {label}", unit, ".1f", LOWER),
     )
 
 
 def _describe_credible() -> tuple[MetricInfo, ...]:
     return tuple(
-        MetricInfo(
+        _percent(
             f"credibility/coverage_{level}",
             f"coverage of the {level} % credible set",
-            "%",
             ".0f",
             HIGHER if level == 90 else NEITHER,  # filters are overconfident; see diagnostics
-            limits=PERCENT,
-            short=f"{level} % credible set",
-            meaning=f"truths in the highest-density set: {level} where calibrated; fewer: "
-            "overconfident",
+            f"{level} % credible set",
+            f"truths in the highest-density set: {level} where calibrated; fewer: overconfident",
         )
         for level in (50, 80, 90, 95)
     )
 
 
+def _describe_regions() -> tuple[MetricInfo, ...]:
+    return tuple(
+        _percent(
+            f"belief/distance_coverage_{level}",
+            f"coverage of the {level} % mean-distance region",
+            ".0f",
+            HIGHER if level == 90 else NEITHER,
+            f"{level} % distance region",
+            f"truths whose mean distance to the particles is within the belief's {level} % "
+            f"quantile: {level} where calibrated; fewer: overconfident",
+        )
+        for level in (50, 90)
+    )
+
+
 _METRICS = (
-    MetricInfo(
-        "instances", "instances", form=".0f", meaning="objects in images, tested one by one"
-    ),
-    MetricInfo(
-        "missed", "missed", form=".0f", direction=LOWER, meaning="images without a finite pose"
-    ),
+    _count("instances", "instances", meaning="objects in images, tested one by one"),
+    _count("missed", "missed", LOWER, meaning="images without a finite pose"),
     *_describe_errors("add", "ADD"),
     *_describe_errors("add_s", "ADD-S"),
     *_describe_bop("mssd", "mm", "0.05 to 0.5 diameters, as in the BOP challenge"),
@@ -198,27 +213,7 @@ _METRICS = (
         meaning="share of the belief that is nearer to the particles than the truth; 0.5 where "
         "calibrated; near 1: the truth lies outside",
     ),
-    MetricInfo(
-        "belief/distance_coverage_50",
-        "coverage of the 50 % mean-distance region",
-        "%",
-        ".0f",
-        limits=PERCENT,
-        short="50 % distance region",
-        meaning="truths whose mean distance to the particles is within the belief's 50 % quantile: "
-        "50 where calibrated; fewer: overconfident",
-    ),
-    MetricInfo(
-        "belief/distance_coverage_90",
-        "coverage of the 90 % mean-distance region",
-        "%",
-        ".0f",
-        HIGHER,
-        limits=PERCENT,
-        short="90 % distance region",
-        meaning="truths whose mean distance to the particles is within the belief's 90 % quantile: "
-        "90 where calibrated; fewer: overconfident",
-    ),
+    *_describe_regions(),
     MetricInfo(
         "credibility/log_density",
         "log density of the truth, mean",
@@ -258,8 +253,8 @@ _METRICS = (
         "no look-alike of the truth",
     ),
     # calibrated probabilities, on frames with the object and without
-    MetricInfo("confidence/frames", "frames with the object", form=".0f"),
-    MetricInfo("confidence/frames_without", "frames without the object", form=".0f"),
+    _count("confidence/frames", "frames with the object"),
+    _count("confidence/frames_without", "frames without the object"),
     _unit(
         "confidence/auroc",
         "AUROC of the probability, right against wrong",
@@ -306,25 +301,23 @@ _METRICS = (
         LOWER,
         meaning="of the frames with the object",
     ),
-    MetricInfo(
+    _count(
         "confidence/false_alarms",
         "false alarms",
-        form=".0f",
-        direction=LOWER,
+        LOWER,
         meaning="frames without the object in which one is found",
     ),
-    MetricInfo("apparent_size/images", "images with a measured scale ratio", form=".0f"),
+    _count("apparent_size/images", "images with a measured scale ratio"),
     MetricInfo(
         "apparent_size/ratio",
         "scale ratio of depth to mesh",
         form=".2f",
         meaning="median apparent size of the object: 1 where depth and intrinsics are right",
     ),
-    MetricInfo(
+    _count(
         "apparent_size/contradicting",
         "images with a scale mismatch",
-        form=".0f",
-        direction=LOWER,
+        LOWER,
         meaning="between depth and mesh: there depth or intrinsics cannot be right",
     ),
     # where particles that are pixels are; lists over the iterations
@@ -360,8 +353,8 @@ _METRICS = (
     ),
     _unit("diagnostics/auroc", "AUROC of the likelihood", short="AUROC", form=".2f"),
     # of a training
-    MetricInfo("training/steps", "training steps", form=".0f", short="steps"),
-    MetricInfo("training/tested_step", "tested step", form=".0f"),
+    _count("training/steps", "training steps", short="steps"),
+    _count("training/tested_step", "tested step"),
     MetricInfo("training/seconds_per_step", "time per training step", "s", ".3g", LOWER),
     MetricInfo(
         "training/cpu_seconds_per_step", "processor time per training step", "s", ".3g", LOWER
@@ -393,7 +386,7 @@ _METRICS = (
     MetricInfo(
         "val_score_drop", "validation score lost since its best", form=".1f", direction=LOWER
     ),
-    MetricInfo("not_finite", "training scalars that are no numbers", form=".0f", direction=LOWER),
+    _count("not_finite", "training scalars that are no numbers", LOWER),
 )
 METRICS = {info.key: info for info in _METRICS}
 _RENAMED = {  # keys of files that earlier versions wrote, and tags that they logged

@@ -36,16 +36,15 @@ def recall(errors: Tensor, threshold: float | Tensor) -> float:
     return float(100 * (errors < threshold).double().mean())
 
 
-def median_mm(errors: Tensor) -> float:
-    """Return the median in millimeters; of an even number, the mean of the middle two.
+def median(errors: Tensor) -> float:
+    """Return the median; of an even number, the mean of the middle two.
 
     Infinite if half the instances or more are missed; NaN without instances.
     """
     if len(errors) == 0:
         return float("nan")
     ordered = errors.double().sort().values
-    middle = ordered[[(len(errors) - 1) // 2, len(errors) // 2]]
-    return float(1000 * middle.mean())
+    return float(ordered[[(len(errors) - 1) // 2, len(errors) // 2]].mean())
 
 
 def summarize(errors: Tensor, diameter: float | Tensor) -> dict[str, float]:
@@ -64,8 +63,18 @@ def summarize(errors: Tensor, diameter: float | Tensor) -> dict[str, float]:
         "auc": auc(errors),
         "recall_01d": recall(errors, 0.1 * diameter),
         "recall_2cm": recall(errors, 0.02),
-        "median_mm": median_mm(errors),
+        "median_mm": 1000 * median(errors),
     }
+
+
+def summarize_rows(rows: Tensor) -> dict[str, dict[str, float]]:
+    """Return the blocks `add` and `add_s` of metrics.json.
+
+    Args:
+        rows: (N, 3) of each instance ADD, ADD-S and the object's diameter [m].
+    """
+    add, add_s, diameter = rows.T
+    return {"add": summarize(add, diameter), "add_s": summarize(add_s, diameter)}
 
 
 def overall(add_auc: float | None, on_object: float, iou: float) -> float:

@@ -1,6 +1,7 @@
 """Figures of a track: one object's poses, frame after frame, against the true ones."""
 
 from collections.abc import Sequence
+from itertools import groupby
 from typing import NamedTuple
 
 import torch
@@ -24,16 +25,12 @@ def find_gaps(tracked: Sequence[bool]) -> list[Gap]:
     Args:
         tracked: Of each frame, whether the object was tracked in it.
     """
-    gaps: list[Gap] = []
-    start: int | None = None
-    for number, one in enumerate(tracked):
-        if not one and start is None:
-            start = number
-        elif one and start is not None:
-            gaps.append(Gap(start, number - start, True))
-            start = None
-    if start is not None:
-        gaps.append(Gap(start, len(tracked) - start, False))
+    gaps, start = list[Gap](), 0
+    for one, frames in groupby(tracked):
+        end = start + len(list(frames))
+        if not one:
+            gaps.append(Gap(start, end - start, end < len(tracked)))
+        start = end
     return gaps
 
 

@@ -6,7 +6,7 @@ from typing import Any
 from torch import Tensor
 
 from posefilter.metrics.collect import PoseErrors, concat_state
-from posefilter.metrics.scores import summarize
+from posefilter.metrics.scores import summarize_rows
 from posefilter.types import ObjectModel
 
 # lower end included, upper only at 1
@@ -43,16 +43,11 @@ class ErrorsByVisibility(PoseErrors):
         """Return {"0.3-0.5": {"instances", "add": {...}, "add_s": {...}}, ...} without empty
         ranges.
         """
-        add, add_s, diameter, visible = (
-            concat_state(x) for x in (self.add, self.add_s, self.diameter, self.visibility)
-        )
+        rows, visible = concat_state(self.rows).reshape(-1, 3), concat_state(self.visibility)
         out = {}
         for low, high in self.ranges:
             selected = (visible >= low) & ((visible < high) if high < 1 else (visible <= 1))
             if bool(selected.any()):
-                parts = {
-                    "add": summarize(add[selected], diameter[selected]),
-                    "add_s": summarize(add_s[selected], diameter[selected]),
-                }
+                parts = summarize_rows(rows[selected])
                 out[f"{low:g}-{high:g}"] = {"instances": int(selected.sum()), **parts}
         return out

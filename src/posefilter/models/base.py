@@ -194,7 +194,7 @@ class PoseEstimator(Module):
             metrics["poses"] = PoseErrors([self.object_model])
             metrics["bop"] = BopErrors([self.object_model])
             metrics["by_visibility"] = ErrorsByVisibility([self.object_model])
-            metrics["belief"] = BeliefQuality([self.object_model])
+            metrics["belief"] = BeliefQuality(self.object_model)
             metrics["credibility"] = Credibility()
             metrics["confidence"] = Confidence()
             metrics["apparent_size"] = ApparentSizes()

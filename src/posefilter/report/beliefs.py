@@ -27,14 +27,11 @@ def chart_coverage(metrics: Mapping[str, Any]) -> list[Panel]:
     """Return the chart of how often credible sets hold the truth, at every level."""
     found = metrics.get("credibility") or {}
     levels = [100 * level for level in found.get("levels") or ()]
-    lines = [
-        Line(
-            label if label == "all" else f"visible share {label}",
-            [0.0, *levels, 100.0],
-            [0.0, *(100 * share for share in shares), 100.0],
-        )
-        for label, _, shares in _list_groups(metrics)
-    ]
+    lines = []
+    for label, _, shares in _list_groups(metrics):
+        name = label if label == "all" else f"visible share {label}"
+        covered = [0.0, *(100 * share for share in shares), 100.0]
+        lines.append(Line(name, [0.0, *levels, 100.0], covered))
     title = "Truths in the credible set"
     if not lines:
         return []

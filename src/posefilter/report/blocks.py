@@ -138,10 +138,8 @@ def draw_charts(panels: Sequence[Panel]) -> list[Charts]:
     for panel in panels:
         light, dark = draw_chart(panel, LIGHT), draw_chart(panel, DARK)
         file = f"{make_slug(panel.title)}-{make_slug(panel.xlabel)}.png"
-        uris = encode_png(light), encode_png(dark)
-        charts.append(
-            Chart(*uris, WIDTH_PX, measure_height(panel), describe_panel(panel), file, light)
-        )
+        uris, size = (encode_png(light), encode_png(dark)), (WIDTH_PX, measure_height(panel))
+        charts.append(Chart(*uris, *size, describe_panel(panel), file, light))
     return [Charts(charts)] if charts else []
 
 

@@ -85,21 +85,12 @@ def draw_chart(panel: Panel, theme: Theme) -> bytes:
     figure.set_facecolor(theme.paper)
     axes = figure.subplots()
     draw_panel(axes, panel, theme)
-    if len(panel.lines) > 1:
-        place = (
-            {"loc": "outside lower center", "ncols": count_columns(panel)}
-            if needs_legend_below(panel)
-            else {"loc": "best"}
-        )
-        legend = figure.legend if needs_legend_below(panel) else axes.legend
-        legend(
-            fontsize=8,
-            frameon=False,
-            labelcolor=theme.ink,
-            handlelength=1.4,
-            borderaxespad=0.2,
-            **place,
-        )
+    style: dict[str, Any] = {"labelcolor": theme.ink, "handlelength": 1.4, "borderaxespad": 0.2}
+    style |= {"fontsize": 8, "frameon": False}
+    if needs_legend_below(panel):
+        figure.legend(loc="outside lower center", ncols=count_columns(panel), **style)
+    elif len(panel.lines) > 1:
+        axes.legend(loc="best", **style)
     return to_small_png(figure)
 
 
@@ -147,9 +138,8 @@ def draw_line(axes: Axes, line: Line, color: str, joined: bool) -> None:
         marks = {"markersize": 3, "alpha": 0.5}
     axes.plot(line.x, line.y, style, color=color, linewidth=1.7, label=line.label, **marks)
     if line.dots:
-        axes.plot(
-            *zip(*line.dots, strict=True), "o", color=color, alpha=0.45, markersize=3.5, linewidth=0
-        )
+        x, y = zip(*line.dots, strict=True)
+        axes.plot(x, y, "o", color=color, alpha=0.45, markersize=3.5, linewidth=0)
 
 
 def is_step(line: Line) -> bool:
@@ -194,11 +184,8 @@ def style_axes(axes: Axes, panel: Panel, theme: Theme) -> None:
             axes.set_xticks(ticks, [f"{x:g}" for x in ticks])
             axes.xaxis.set_minor_locator(NullLocator())
         elif not panel.log_x:
-            axes.xaxis.set_major_locator(
-                MaxNLocator(
-                    6, integer=all(float(x).is_integer() for line in panel.lines for x in line.x)
-                )
-            )
+            whole = all(float(x).is_integer() for line in panel.lines for x in line.x)
+            axes.xaxis.set_major_locator(MaxNLocator(6, integer=whole))
         if panel.limits:
             axes.set_ylim(*panel.limits)
         if panel.diagonal:
@@ -233,7 +220,6 @@ def shorten(text: str, max_length: int = 22) -> str:
 def to_small_png(figure: Figure) -> bytes:
     """Return a figure as a PNG of 128 colors, a third of the plain one."""
     stream = BytesIO()
-    Image.fromarray(rasterize(figure)).quantize(128, dither=Image.Dither.NONE).save(
-        stream, "PNG", optimize=True
-    )
+    small = Image.fromarray(rasterize(figure)).quantize(128, dither=Image.Dither.NONE)
+    small.save(stream, "PNG", optimize=True)
     return stream.getvalue()

@@ -17,6 +17,7 @@ from posefilter.report.blocks import (
     Heading,
     Paragraph,
     Section,
+    Style,
     Table,
     Text,
     Tile,
@@ -80,12 +81,8 @@ def read_two_runs(text: str) -> tuple[Run, Run]:
 
 def match_images(a: Sequence[ImageError], b: Sequence[ImageError]) -> list[Pair]:
     """Return the images that two tests share, by dataset name and ids, in the first one's order."""
-
-    def identify(row: ImageError) -> tuple[str, int, int, int, str]:
-        return row.image, row.scene_id, row.im_id, row.obj_id, row.object
-
-    others = {identify(row): row for row in b}
-    return [Pair(row, others[identify(row)]) for row in a if identify(row) in others]
+    others = {row[:5]: row for row in b}
+    return [Pair(row, others[row[:5]]) for row in a if row[:5] in others]
 
 
 def judge(pairs: Sequence[Pair]) -> Verdict:
@@ -125,22 +122,13 @@ def make_comparison_page(a: Run, b: Run, command: str) -> Page:
         ),
         Section("Settings that differ", list_settings(a, b, names)),
     ]
-    lines = [
-        Paragraph(
-            [
-                Text(name, "badge"),
-                Text(str(run.folder), "code"),
-                f"{run.named('model')}, {run.named('variant')}",
-            ]
-        )
-        for name, run in zip(names, (a, b), strict=True)
-    ]
-    notes = [
-        f"{len(run.errors) - len(pairs)} images of {name} are not in the other test; they are "
-        f"left out."
-        for name, run in zip(names, (a, b), strict=True)
-        if len(run.errors) > len(pairs)
-    ]
+    lines, notes = list[Paragraph](), list[str]()
+    for name, run in zip(names, (a, b), strict=True):
+        what = f"{run.named('model')}, {run.named('variant')}"
+        lines.append(Paragraph([Text(name, "badge"), Text(str(run.folder), "code"), what]))
+        left = len(run.errors) - len(pairs)
+        if left > 0:
+            notes.append(f"{left} images of {name} are not in the other test; they are left out.")
     title = f"{names[0]} against {names[1]}"
     foot = Paragraph(["Made with", Text(command, "code")])
     return Page(title, title, lines, make_tiles(pairs, names), notes, sections, foot)
@@ -201,10 +189,8 @@ def tabulate_common(rows: dict[str, list[ImageError]]) -> Table:
         change = second - first if math.isfinite(first) and math.isfinite(second) else 0.0
         difference: Cell = "alike"
         if f"{abs(change):.1f}" != "0.0":
-            difference = Text(
-                f"{change:+.1f} {info.unit}".strip(),
-                "good" if change * info.direction > 0 else "bad",
-            )
+            style: Style = "good" if change * info.direction > 0 else "bad"
+            difference = Text(f"{change:+.1f} {info.unit}".strip(), style)
         cells.append([info.label, info.describe(first), info.describe(second), difference])
     return Table(("", *rows, "change"), cells, numeric=(1, 2, 3), form="narrow")
 
@@ -214,22 +200,10 @@ def chart_pairs(pairs: Sequence[Pair], names: tuple[str, str]) -> list[Panel]:
     both = [pair for pair in pairs if all(0 < row.add_mm < math.inf for row in pair)]
     if not both:
         return []
-    ends = [f(row.add_mm for pair in both for row in pair) for f in (min, max)]
+    least, most = (f(row.add_mm for pair in both for row in pair) for f in (min, max))
     dots = Line("an image", [pair.a.add_mm for pair in both], [pair.b.add_mm for pair in both])
-    xlabel = f"ADD of {names[0]} [mm]"
-    diagonal = (ends[0], ends[1])
-    return [
-        Panel(
-            f"ADD of {names[1]}",
-            xlabel,
-            "mm",
-            [dots],
-            joined=False,
-            log_x=True,
-            log_y=True,
-            diagonal=diagonal,
-        )
-    ]
+    axes = (f"ADD of {names[1]}", f"ADD of {names[0]} [mm]", "mm")
+    return [Panel(*axes, [dots], joined=False, log_x=True, log_y=True, diagonal=(least, most))]
 
 
 def list_changes_of_images(pairs: Sequence[Pair], names: tuple[str, str]) -> list[Block]:

@@ -2,6 +2,8 @@
 
 import math
 from collections.abc import Mapping
+from itertools import pairwise
+from statistics import median_high
 from typing import Any, NamedTuple
 
 from posefilter.metrics.registry import MetricInfo, find_metric, read_number, rename_key
@@ -62,11 +64,8 @@ DIAGNOSTICS = (
 def diagnose(run: Run) -> list[Finding]:
     """Return the diagnostics that a run has numbers for, the bad ones first."""
     known = collect_numbers(run)
-    found = [
-        Finding(one, known[one.key], one.is_bad(known[one.key]))
-        for one in DIAGNOSTICS
-        if one.key in known
-    ]
+    own = [(one, known[one.key]) for one in DIAGNOSTICS if one.key in known]
+    found = [Finding(one, value, one.is_bad(value)) for one, value in own]
     return sorted(found, key=lambda finding: not finding.bad)
 
 
@@ -86,24 +85,16 @@ def collect_numbers(run: Run) -> dict[str, float]:
         out["val_score_drop"] = max(score.values) - score.values[-1]
     training = [curve for tag, curve in run.curves.items() if tag.startswith("train/")]
     if training:
-        out["not_finite"] = float(
-            sum(not math.isfinite(x) for curve in training for x in curve.values)
-        )
+        values = (x for curve in training for x in curve.values)
+        out["not_finite"] = float(sum(not math.isfinite(x) for x in values))
     return {name: value for name, value in out.items() if math.isfinite(value)}
 
 
 def read_last_validation(curves: Mapping[str, Curve]) -> tuple[int | None, dict[str, float]]:
     """Return the step and the numbers of the last validation; None and nothing before the first."""
-    own = {
-        tag.removeprefix("val/"): curve
-        for tag, curve in curves.items()
-        if tag.startswith(("val/", "diagnostics/"))
-    }
-    if not own:
-        return None, {}
-    return max(curve.steps[-1] for curve in own.values()), {
-        name: curve.values[-1] for name, curve in own.items()
-    }
+    own = {tag: one for tag, one in curves.items() if tag.startswith(("val/", "diagnostics/"))}
+    step = max((curve.steps[-1] for curve in own.values()), default=None)
+    return step, {tag.removeprefix("val/"): curve.values[-1] for tag, curve in own.items()}
 
 
 def list_numbers(metrics: Mapping[str, Any]) -> dict[str, float]:
@@ -116,18 +107,12 @@ def collect_timings(run: Run) -> list[tuple[str, str]]:
     train = run.curves.get("train/loss")
     out = []
     if train and len(train.steps) > 1:
-        pace = sorted(
-            (b - a) / (t - s)
-            for a, b, s, t in zip(
-                train.steps, train.steps[1:], train.times, train.times[1:], strict=False
-            )
-            if t > s and b > a
-        )
+        logged = pairwise(zip(train.steps, train.times, strict=True))
+        pace = [(b - a) / (t - s) for (a, s), (b, t) in logged if t > s and b > a]
         if pace:
-            out.append(("training steps a second (median)", f"{pace[len(pace) // 2]:.2f}"))
-        out.append(
-            ("training, validations included", format_duration(train.times[-1] - train.times[0]))
-        )
+            out.append(("training steps a second (median)", f"{median_high(pace):.2f}"))
+        spent = format_duration(train.times[-1] - train.times[0])
+        out.append(("training, validations included", spent))
     if seconds := collect_numbers(run).get("seconds_per_image"):
         out.append(("filter, an image", f"{seconds:.3f} s"))
     return out

@@ -1,7 +1,7 @@
 """Gather what a run's folder holds; what it lacks is written down rather than fatal."""
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -76,6 +76,7 @@ def read_run(folder: Path) -> Run:
     typed = read_part(hydra, ("hydra", "overrides"), said)
     curves, logged = read_events(folder)
     files = read_images(folder / "figures")
+    evaluation = bool(metrics.get("checkpoint")) and not config  # no training's folder
     return Run(
         folder=folder,
         metrics=metrics,
@@ -91,7 +92,7 @@ def read_run(folder: Path) -> Run:
         curves=curves,
         pictures=[*files, *select_unsaved(logged, files)],
         errors=read_image_errors(folder),
-        missing=list_missing(folder, bool(files or logged), is_evaluation(metrics, config)),
+        missing=list_missing(folder, bool(files or logged), evaluation),
     )
 
 
@@ -101,7 +102,7 @@ def check_run(folder: Path) -> None:
         raise UserError(f"run={folder}: no such folder")
     if any((folder / mark).is_file() for mark in MARKS) or any(find_event_files(folder)):
         return
-    if is_sweep(folder):
+    if any((folder / mark).is_file() for mark in SWEEP_MARKS):
         raise UserError(f"run={folder}: is a sweep's folder; give it as sweep={folder}")
     raise UserError(
         f"run={folder}: is no run's folder (it has no metrics.json, no "
@@ -109,43 +110,25 @@ def check_run(folder: Path) -> None:
     )
 
 
-def is_sweep(folder: Path) -> bool:
-    """Tell whether a folder is a sweep's."""
-    return any((folder / mark).is_file() for mark in SWEEP_MARKS)
-
-
-def is_evaluation(metrics: Mapping[str, Any], config: Mapping[str, Any]) -> bool:
-    """Tell whether a folder is of evaluate.py, and no training's."""
-    return bool(metrics.get("checkpoint")) and not config
-
-
 def list_missing(folder: Path, pictures: bool, evaluation: bool) -> list[str]:
     """Return what a run's folder lacks, and what that means."""
+
+    def lacks(name: str) -> bool:
+        return not (folder / name).is_file()
+
     if evaluation:
         said = "An evaluation: how its checkpoint was trained is told by the run that wrote it."
-        lacking = not (folder / FILE).is_file()
-        return [said, *([_NO_ERRORS] if lacking else [])]
-    lacks = (
-        ("No metrics.json: the run has not been tested.", not (folder / "metrics.json").is_file()),
-        (
-            _NO_ERRORS,
-            (folder / "metrics.json").is_file() and not (folder / FILE).is_file(),
-        ),
-        (
-            "No TensorBoard events, so no curves and no timings of the training.",
-            not any(find_event_files(folder)),
-        ),
-        ("No pictures in figures/ or in the events, so no gallery.", not pictures),
-        (
-            "No .hydra folder: what was configured is not known.",
-            not (folder / ".hydra" / "config.yaml").is_file(),
-        ),
-        (
-            "No data.json: how its data were split is not known.",
-            not (folder / "data.json").is_file(),
-        ),
-    )
-    return [sentence for sentence, true in lacks if true]
+        return [said, *([_NO_ERRORS] if lacks(FILE) else [])]
+    events = any(find_event_files(folder))
+    sentences = {
+        "No metrics.json: the run has not been tested.": lacks("metrics.json"),
+        _NO_ERRORS: lacks(FILE) and not lacks("metrics.json"),
+        "No TensorBoard events, so no curves and no timings of the training.": not events,
+        "No pictures in figures/ or in the events, so no gallery.": not pictures,
+        "No .hydra folder: what was configured is not known.": lacks(".hydra/config.yaml"),
+        "No data.json: how its data were split is not known.": lacks("data.json"),
+    }
+    return [sentence for sentence, true in sentences.items() if true]
 
 
 def read_metrics(path: Path) -> dict[str, Any]:

@@ -59,9 +59,8 @@ def group_by_visibility(rows: Sequence[ImageError]) -> list[list[ImageError]]:
     """Return the images in ranges of their visible share, about as many in each; unknown shares are
     left out.
     """
-    known = sorted(
-        (row for row in rows if math.isfinite(row.visibility)), key=lambda row: row.visibility
-    )
+    known = [row for row in rows if math.isfinite(row.visibility)]
+    known.sort(key=lambda row: row.visibility)
     count = min(MOST, len(known) // FEWEST)
     if count < 2:
         return []
@@ -72,41 +71,25 @@ def chart_errors(runs: Mapping[str, Sequence[ImageError]]) -> list[Panel]:
     """Return the charts of one run's errors, or of several, a line each; the name of a single one
     is not shown.
     """
-    runs = {
-        name: rows
-        for name, rows in runs.items()
-        if any(math.isfinite(row.diameter_mm) for row in rows)
-    }
-    cdf, by_share, by_auc = [], [], []
+    posed = {n for n, rows in runs.items() if any(math.isfinite(r.diameter_mm) for r in rows)}
+    runs = {name: rows for name, rows in runs.items() if name in posed}
+    cdf, by_share, by_auc = list[Line](), list[Line](), list[Line]()
     for name, rows in runs.items():
-        for label, key in (
-            (("ADD", "add_mm"), ("ADD-S", "add_s_mm")) if len(runs) == 1 else ((name, "add_mm"),)
-        ):
-            cdf.append(Line(label, *compute_cdf([getattr(row, key) for row in rows])))
+        alone = len(runs) == 1
+        cdf.append(Line("ADD" if alone else name, *compute_cdf([row.add_mm for row in rows])))
+        if alone:
+            cdf.append(Line("ADD-S", *compute_cdf([row.add_s_mm for row in rows])))
         parts = group_by_visibility(rows)
         seen = [float(np.mean([row.visibility for row in part])) for part in parts]
         if parts:
-            by_share.append(
-                Line(
-                    name,
-                    seen,
-                    [100 * float(np.mean([is_found(row) for row in part])) for part in parts],
-                )
-            )
+            found = [100 * float(np.mean([is_found(row) for row in part])) for part in parts]
+            by_share.append(Line(name, seen, found))
             by_auc.append(Line(name, seen, [measure_auc(part) for part in parts]))
-    out = (
-        [Panel("Images with an error below a threshold", "threshold [mm]", "%", cdf, PERCENT)]
-        if cdf
-        else []
-    )
+    out = [Panel("Images with an error below a threshold", "threshold [mm]", "%", cdf, PERCENT)]
     for lines, key in ((by_auc, "add/auc"), (by_share, "add/recall_01d")):
-        info = find_metric(key)
-        out += (
-            [Panel(f"{info.label} by visibility", "visible share", info.unit, lines, PERCENT)]
-            if lines
-            else []
-        )
-    return out
+        info, title = find_metric(key), f"{find_metric(key).label} by visibility"
+        out.append(Panel(title, "visible share", info.unit, lines, PERCENT))
+    return [panel for panel in out if panel.lines]
 
 
 def is_found(row: ImageError) -> bool:
@@ -131,10 +114,8 @@ def show_errors(rows: Sequence[ImageError]) -> list[Block]:
 def list_worst(rows: Sequence[ImageError]) -> list[Block]:
     """Return the images with the greatest errors, by name."""
     posed = [row for row in rows if not math.isnan(row.add_mm)]
-    if posed:
-        worst = sorted(posed, key=lambda row: -row.add_mm)[:LISTED]
-    else:
-        worst = sorted(rows, key=lambda row: row.particles_on_object)[:LISTED]
+    worst = sorted(posed, key=lambda row: -row.add_mm)[:LISTED]
+    worst = worst or sorted(rows, key=lambda row: row.particles_on_object)[:LISTED]
     cells: list[list[Cell]] = [
         [
             Text(row.image, "code"),
@@ -148,8 +129,5 @@ def list_worst(rows: Sequence[ImageError]) -> list[Block]:
     head = ("image", "visible share", "ADD", "ADD-S", "particles on the object")
     where = Paragraph(["Every image is in", Text(FILE, "code"), "in the run's folder."])
     table = Table(head, cells, numeric=range(1, len(head)))
-    return [
-        Heading("Images"),
-        Fold(f"The {len(worst)} worst of {len(rows)} images", [table]),
-        where,
-    ]
+    fold = Fold(f"The {len(worst)} worst of {len(rows)} images", [table])
+    return [Heading("Images"), fold, where]

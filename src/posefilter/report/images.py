@@ -63,13 +63,9 @@ def read_images(folder: Path) -> list[StoredImage]:
     """
     if not folder.is_dir():
         return []
-    files = sorted(
-        (p for p in folder.iterdir() if p.suffix.lower() in SUFFIXES),
-        key=lambda p: sort_by_number(p.name),
-    )
-    return [
-        StoredImage(path.stem, path.stem.replace("_", " "), path.read_bytes()) for path in files
-    ]
+    files = [path for path in folder.iterdir() if path.suffix.lower() in SUFFIXES]
+    files.sort(key=lambda path: sort_by_number(path.name))
+    return [StoredImage(p.stem, p.stem.replace("_", " "), p.read_bytes()) for p in files]
 
 
 def sort_by_number(name: str) -> list[tuple[int, str]]:

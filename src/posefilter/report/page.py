@@ -37,7 +37,8 @@ class Page:
         sections = [
             Section(title, kept) for title, blocks in self.sections if (kept := drop_empty(blocks))
         ]
-        style = resources.files("posefilter.report").joinpath("templates", "page.css").read_text()
+        file = resources.files("posefilter.report").joinpath("templates", "page.css")
+        style = file.read_text(encoding="utf-8")
         return (
             open_templates()
             .get_template("page.html")

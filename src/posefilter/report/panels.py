@@ -49,7 +49,11 @@ def choose_panels(curves: Mapping[str, Curve], charts: Mapping[str, Sequence[str
     for title, keys in charts.items():
         infos = {key: find_metric(key) for key in keys if key in curves}
         lines = [
-            Line(info.short or info.label, curves[key].steps, scale_curve(curves[key], info.factor))
+            Line(
+                info.short or info.label,
+                curves[key].steps,
+                [info.convert(value) for value in curves[key].values],
+            )
             for key, info in infos.items()
         ]
         if lines:
@@ -81,14 +85,8 @@ def make_training_panels(curves: Mapping[str, Curve]) -> list[Panel]:
     out = [Panel("Training loss", "training step", "", losses)] if losses else []
     for name, unit in units.items():
         line = Line(name, own[name].steps, own[name].values)
-        out.append(
-            Panel(
-                name.removesuffix(f"_{unit}").replace("_", " ").capitalize(),
-                "training step",
-                unit,
-                [line],
-            )
-        )
+        title = name.removesuffix(f"_{unit}").replace("_", " ").capitalize()
+        out.append(Panel(title, "training step", unit, [line]))
     if rate:
         newest = max((curves[tag] for tag in rate), key=lambda curve: curve.times[-1])
         line = Line("learning rate", newest.steps, newest.values)
@@ -111,8 +109,3 @@ def make_health_panels(curves: Mapping[str, Curve]) -> list[Panel]:
         line = Line(info.label, steps, [info.convert(values[step]) for step in steps])
         out.append(Panel(info.label.capitalize(), "iteration", info.unit, [line], info.limits))
     return out
-
-
-def scale_curve(curve: Curve, factor: float) -> list[float]:
-    """Return a curve's values in another unit."""
-    return [factor * value for value in curve.values]

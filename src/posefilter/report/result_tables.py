@@ -4,16 +4,8 @@ from collections.abc import Mapping
 from typing import Any
 
 from posefilter.metrics.registry import METRICS, find_metric, read_number
-from posefilter.report.blocks import (
-    Block,
-    Cell,
-    Heading,
-    Table,
-    Text,
-)  # fmt: skip
-from posefilter.report.diagnostics import (
-    collect_numbers,
-)
+from posefilter.report.blocks import Block, Cell, Heading, Table, Text
+from posefilter.report.diagnostics import collect_numbers
 from posefilter.report.gather import Run
 
 ROWS = (
@@ -47,10 +39,8 @@ def compare_numbers(columns: Mapping[str, Mapping[str, Any]]) -> Table:
     rows: list[list[Cell]] = []
     for info in map(find_metric, ROWS):
         values = [read_number(metrics, info.key) for metrics in columns.values()]
-        if any(value is not None for value in values):
-            rows.append(
-                [info.label, *("–" if value is None else info.describe(value) for value in values)]
-            )
+        cells = ["–" if value is None else info.describe(value) for value in values]
+        rows += [] if all(value is None for value in values) else [[info.label, *cells]]
     return Table(("", *columns), rows, numeric=range(1, len(columns) + 1), form="narrow")
 
 
@@ -58,21 +48,13 @@ def list_visibility(metrics: Mapping[str, Any]) -> list[Block]:
     """Return errors by visibility: ranges that share no image, and apart from them those from a
     share upwards.
     """
-    found = {
-        tuple(float(end) for end in name.split("-")): own
-        for name, own in (metrics.get("by_visibility") or {}).items()
-    }
-    apart = {
-        f"{low:g} to {high:g}": found[low, high] for low, high in APART if (low, high) in found
-    }
-    above = {
-        f"at least {ends[0]:g}": own for ends, own in sorted(found.items()) if ends not in APART
-    }
+    known = (metrics.get("by_visibility") or {}).items()
+    found = {tuple(float(end) for end in name.split("-")): own for name, own in known}
+    apart = {f"{ends[0]:g} to {ends[1]:g}": found[ends] for ends in APART if ends in found}
+    above = {f"at least {ends[0]:g}": found[ends] for ends in sorted(found) if ends not in APART}
     out: list[Block] = []
-    for heading, ranges in (
-        ("By visibility", apart),
-        ("Of images in which enough is visible", above),
-    ):
+    tables = {"By visibility": apart, "Of images in which enough is visible": above}
+    for heading, ranges in tables.items():
         rows = [
             [name, str(own["instances"]), *(format_number(own, key) for key in BY_VISIBILITY)]
             for name, own in ranges.items()

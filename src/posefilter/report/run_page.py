@@ -50,49 +50,26 @@ def make_run_page(run: Run, changed: Sequence[Change] | None, command: str) -> P
         command: What made the page.
     """
     images = group_by_section([p for p in run.pictures if name_figure(p.name) != "health"])
-    curves = [
-        *panels.choose_panels(run.curves, panels.VALIDATION),
-        *panels.make_training_panels(run.curves),
-    ]
+    signs = panels.choose_panels(run.curves, panels.SIGNS)
+    validation = panels.choose_panels(run.curves, panels.VALIDATION)
+    training = panels.make_training_panels(run.curves)
     beliefs = draw_charts(panels.choose_panels(run.curves, panels.BELIEF))
+    belief = [*list_belief(run), *show_calibration(run.metrics), *beliefs]
+    health = draw_charts(panels.make_health_panels(run.curves))
     sections = [
-        Section(
-            "Diagnostics",
-            [*list_diagnostics(run), *draw_charts(panels.choose_panels(run.curves, panels.SIGNS))],
-        ),
+        Section("Diagnostics", [*list_diagnostics(run), *draw_charts(signs)]),
         Section("Worst and best", show_worst_and_best(images)),
         Section("Results", [*list_results(run), *show_errors(run.errors)]),
-        Section("Curves", draw_charts(curves)),
-        Section(
-            "Belief",
-            [
-                *list_belief(run),
-                *show_calibration(run.metrics),
-                *beliefs,
-                *show_images(images["belief"], wide=True),
-            ],
-        ),
-        Section(
-            "The filter at work",
-            [
-                *draw_charts(panels.make_health_panels(run.curves)),
-                *show_images(images["particles"], wide=True),
-            ],
-        ),
+        Section("Curves", draw_charts([*validation, *training])),
+        Section("Belief", [*belief, *show_images(images["belief"], wide=True)]),
+        Section("The filter at work", [*health, *show_images(images["particles"], wide=True)]),
         Section("More images", show_images(images["more"], wide=True)),
         Section("Settings", list_settings(run, changed)),
         Section("Time and machine", [list_machine(run)]),
     ]
-    title = f"{run.folder.resolve().name}: {run.named('model')}"
-    return Page(
-        title,
-        run.named("model"),
-        head_lines(run),
-        make_tiles(run),
-        run.missing,
-        sections,
-        make_foot(run, command),
-    )
+    name, lines, foot = run.named("model"), head_lines(run), make_foot(run, command)
+    title = f"{run.folder.resolve().name}: {name}"
+    return Page(title, name, lines, make_tiles(run), run.missing, sections, foot)
 
 
 def head_lines(run: Run) -> list[Paragraph]:
@@ -103,24 +80,16 @@ def head_lines(run: Run) -> list[Paragraph]:
     if run.metrics:
         badge, state = Text("tested", "done"), f"on {int(run.metrics.get('instances') or 0)} images"
     else:
-        badge = Text("not tested yet", "badge")
-        state = (
-            f"at step {train.steps[-1] + 1}" + (f" of {most}" if most else "")
-            if train
-            else "nothing logged yet"
-        )
+        badge, state = Text("not tested yet", "badge"), "nothing logged yet"
+        if train:
+            state = f"at step {train.steps[-1] + 1}" + (f" of {most}" if most else "")
         state += f"; numbers of the validation at step {step}" if step is not None else ""
-    objects = ", ".join(run.data.get("objects") or []) or str(
-        (run.config.get("data") or {}).get("object") or ""
-    )
-    line = " · ".join(
-        part for part in (run.named("variant"), f"loss {run.named('loss')}", objects) if part
-    )
-    return [
-        Paragraph([badge, state]),
-        Paragraph([line]),
-        Paragraph([Text(str(run.folder), "code")]),
-    ]
+    chosen = (run.config.get("data") or {}).get("object") or ""
+    objects = ", ".join(run.data.get("objects") or []) or str(chosen)
+    parts = (run.named("variant"), f"loss {run.named('loss')}", objects)
+    line = " · ".join(part for part in parts if part)
+    where = Text(str(run.folder), "code")
+    return [Paragraph([badge, state]), Paragraph([line]), Paragraph([where])]
 
 
 def make_tiles(run: Run) -> list[Tile]:
@@ -136,11 +105,8 @@ def list_diagnostics(run: Run) -> list[Block]:
     bad = sum(finding.bad for finding in found)
     if not found:
         return []
-    say = (
-        f"{bad} of {len(found)} signs of failure are there."
-        if bad
-        else f"None of {len(found)} signs of failure is there."
-    )
+    count = f"of {len(found)} signs of failure"
+    say = f"{bad} {count} are there." if bad else f"None {count} is there."
     rows: list[list[Cell]] = []
     for one, value, is_bad in found:
         side = "above" if one.info.direction < 0 else "below"
@@ -174,33 +140,22 @@ def list_settings(run: Run, changed: Sequence[Change] | None) -> list[Block]:
     typed = " ".join(run.overrides)
     out: list[Block] = []
     if run.config or run.overrides:
-        out.append(
-            Paragraph(["Typed:", Text(typed, "code") if typed else "nothing: all is default"])
-        )
-    if changed is None:
-        out += (
-            [Paragraph([Text("These settings cannot be compared with today's defaults.", "soft")])]
-            if run.config
-            else []
-        )
-    else:
+        said = Text(typed, "code") if typed else "nothing: all is default"
+        out.append(Paragraph(["Typed:", said]))
+    if changed is not None:
         name = Text(f"model={run.named('model')} variant={run.named('variant')}", "code")
-        which = "Settings that" if changed else "No settings"
-        out.append(
-            Paragraph(
-                [f"{which} differ from the defaults of", name, "in this version of the code."]
-            )
-        )
+        which = f"{'Settings that' if changed else 'No settings'} differ from the defaults of"
+        out.append(Paragraph([which, name, "in this version of the code."]))
         out.append(list_changes(changed, ("this run", "default")))
+    elif run.config:
+        said = Text("These settings cannot be compared with today's defaults.", "soft")
+        out.append(Paragraph([said]))
     choices = [
         (k, v) for k, v in sorted(run.choices.items()) if not k.startswith("hydra/") and v != "null"
     ]
     rows = [[Text(group, "code"), Text(choice, "code")] for group, choice in choices]
-    return (
-        [*out, Fold(f"All {len(rows)} choices", [Table(("group", "choice"), rows)])]
-        if rows
-        else out
-    )
+    table = Table(("group", "choice"), rows)
+    return [*out, Fold(f"All {len(rows)} choices", [table])] if rows else out
 
 
 def list_changes(changed: Sequence[Change], names: tuple[str, str]) -> Table:
@@ -227,9 +182,8 @@ def list_machine(run: Run) -> Table:
     if data.get("root"):
         rows.append([f"data, from {data.get('source')}", Text(str(data["root"]), "code")])
     for name, split in (data.get("splits") or {}).items():
-        rows.append(
-            [f"data, {name}", f"{split.get('frames')} frames of {split.get('scenes')} scenes"]
-        )
+        size = f"{split.get('frames')} frames of {split.get('scenes')} scenes"
+        rows.append([f"data, {name}", size])
     return Table(("", ""), rows, form="pairs")
 
 

@@ -34,14 +34,10 @@ def draw_summary(sweep: Sweep) -> Figure | None:
     figure = create_figure(columns * WIDTH_PX, sum(heights) + _TITLE_PX)
     figure.set_layout_engine("constrained")
     count = f"{len(sweep.jobs)} run{'s' * (len(sweep.jobs) != 1)}"
-    notes = (
-        "one seed each: differences may be chance"
-        if once
-        else "line or large dot: mean over seeds; small dots: runs"
-    )
-    figure.suptitle(
-        f"Sweep over {', '.join(sweep.shown)}: {count}\n{notes}", fontsize=12, fontweight="bold"
-    )
+    several = "line or large dot: mean over seeds; small dots: runs"
+    notes = "one seed each: differences may be chance" if once else several
+    title = f"Sweep over {', '.join(sweep.shown)}: {count}\n{notes}"
+    figure.suptitle(title, fontsize=12, fontweight="bold")
     axes = figure.subplots(len(rows), columns, squeeze=False, height_ratios=heights)
     for axis, line, row in zip(charts, axes, rows, strict=True):
         for own, panel in zip(line, row, strict=True):

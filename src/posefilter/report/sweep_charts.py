@@ -5,11 +5,7 @@ from statistics import mean
 
 from posefilter.metrics.registry import MetricInfo, find_metric
 from posefilter.report.charts import Line, Panel
-from posefilter.report.sweeps import (
-    Group,
-    Sweep,
-    Value,
-)  # fmt: skip
+from posefilter.report.sweeps import Group, Sweep, Value
 
 MOST_LINES = 6  # values of a second axis that become lines, settings that get a name
 
@@ -28,41 +24,18 @@ def chart_over(
         return []
     numeric = not any(isinstance(value, str) for value in values)
     spots = {value: float(value) if numeric else float(i) for i, value in enumerate(values)}
-    others = [
-        other
-        for other in sweep.shown
-        if other != axis and 1 < len(sweep.values(other)) <= MOST_LINES
-    ]
-    kinds = [(others[0], value) for value in sweep.values(others[0])] if others else [None]
+    few = (one for one in sweep.shown if one != axis and 1 < len(sweep.values(one)) <= MOST_LINES)
+    other = next(few, None)
+    kinds = [None] if other is None else [(other, value) for value in sweep.values(other)]
     low = min(spots.values())
     log_x = numeric and low > 0 and max(spots.values()) / low >= 8
+    ticks, categories = tuple(spots.values()), () if numeric else [str(v) for v in values]
     out = []
     for info in infos:
-        lines = [
-            line_over(
-                axis,
-                spots,
-                [g for g in found if kind is None or g.place[kind[0]] == kind[1]],
-                info,
-                kind,
-            )
-            for kind in kinds
-        ]
-        lines = [line for line in lines if len(line.x)]
-        if lines:
-            categories = () if numeric else [str(v) for v in values]
-            out.append(
-                Panel(
-                    info.label,
-                    axis,
-                    info.unit,
-                    lines,
-                    info.limits,
-                    categories,
-                    log_x,
-                    ticks=tuple(spots.values()),
-                )
-            )
+        lines = [line_over(axis, spots, found, info, kind) for kind in kinds]
+        shown = [line for line in lines if len(line.x)]
+        axes = (info.label, axis, info.unit, shown, info.limits, categories, log_x)
+        out += [Panel(*axes, ticks=ticks)] if shown else []
     return out
 
 
@@ -73,9 +46,12 @@ def line_over(
     info: MetricInfo,
     kind: tuple[str, Value] | None,
 ) -> Line:
-    """Return means over an axis with the range, and single runs, of some groups."""
+    """Return means over an axis with the range, and single runs, of all groups or of those that
+    have a value on another axis.
+    """
+    own = [g for g in found if kind is None or g.place[kind[0]] == kind[1]]
     at = {
-        spot: [info.convert(y) for g in found if g.place[axis] == value for y in g.of(info.key)]
+        spot: [info.convert(y) for g in own if g.place[axis] == value for y in g.of(info.key)]
         for value, spot in spots.items()
     }
     at = {spot: ys for spot, ys in at.items() if ys}
@@ -97,15 +73,14 @@ def chart_against_time(found: Sequence[Group]) -> list[Panel]:
     cost = find_metric("seconds_per_image")
     # what sweeps maximize: the one, or else the other
     for info in map(find_metric, ("add/auc", "particles_on_object")):
-        pairs = [
-            (group, group.of(cost.key), [info.convert(y) for y in group.of(info.key)])
-            for group in found
+        lines = [
+            Line(spell(one.place), [mean(x)], [mean(info.convert(value) for value in y)])
+            for one in found
+            if (x := one.of(cost.key)) and (y := one.of(info.key))
         ]
-        lines = [Line(spell(g.place), [mean(x)], [mean(y)]) for g, x, y in pairs if x and y]
         if len(lines) > MOST_LINES:  # too many for a legend: the table tells them apart
-            lines = [
-                Line("a setting", [line.x[0] for line in lines], [line.y[0] for line in lines])
-            ]
+            x, y = [line.x[0] for line in lines], [line.y[0] for line in lines]
+            lines = [Line("a setting", x, y)]
         if lines:
             return [Panel(info.label, cost.title, info.unit, lines, info.limits, joined=False)]
     return []

@@ -65,34 +65,20 @@ def make_sweep_page(
     # of one run: where a setting has several, its mean is what counts
     alone = all(len(group.jobs) == 1 for group in found) or not sweep.shown
     tiles = make_tiles(best) if best and alone else []
-    return Page(
-        title,
-        f"Sweep over {over_what}",
-        head_lines(sweep, winner),
-        tiles,
-        list_notes(sweep, best),
-        sections,
-        foot,
-    )
+    heading, lines = f"Sweep over {over_what}", head_lines(sweep, winner)
+    return Page(title, heading, lines, tiles, list_notes(sweep, best), sections, foot)
 
 
 def list_metrics(sweep: Sweep) -> list[MetricInfo]:
     """Return what the runs have numbers of."""
-    return [
-        find_metric(key)
-        for key in COLUMNS.values()
-        if any(key in job.numbers for job in sweep.jobs)
-    ]
+    known = {key for job in sweep.jobs for key in job.numbers}
+    return [find_metric(key) for key in COLUMNS.values() if key in known]
 
 
 def head_lines(sweep: Sweep, winner: Job) -> list[Paragraph]:
     """Return what stands below the heading: how many runs, which is the best, where they are."""
-    count = (
-        f"{len(sweep.jobs)} of {len(sweep.jobs) + len(sweep.unfinished)}"
-        if sweep.unfinished
-        else str(len(sweep.jobs))
-    )
-    badge = Text(f"{count} runs", "badge" if sweep.unfinished else "done")
+    done, left = len(sweep.jobs), len(sweep.unfinished)
+    badge = Text(f"{done} of {done + left} runs", "badge") if left else Text(f"{done} runs", "done")
     return [
         Paragraph([badge, "best:", *name_best(sweep, winner)]),
         Paragraph([Text(str(sweep.folder), "code")]),
@@ -106,18 +92,14 @@ def name_best(sweep: Sweep, winner: Job) -> list[Cell]:
     found = group_jobs(sweep)
     group = found[find_best_group(found)]
     if sweep.shown and len(group.jobs) > 1:
-        figures = [
-            f"{info.label} {format_mean(group.of(info.key), info)}"
-            for info in list_metrics(sweep)[:1]
-        ]
+        infos = list_metrics(sweep)[:1]
+        figures = [f"{info.label} {format_mean(group.of(info.key), info)}" for info in infos]
         why = f"({', '.join([*figures, f'mean of {len(group.jobs)} seeds'])})"
         return [Text(spell(group.place), "code"), Text(why, "soft")]
     tied = find_ties(sweep)
     ties = f"({tied} runs have its score to one decimal; it has the least median ADD)"
-    return [
-        Text(spell(winner.place) or winner.folder, "code"),
-        *([Text(ties, "soft")] if tied > 1 else []),
-    ]
+    name = Text(spell(winner.place) or winner.folder, "code")
+    return [name, Text(ties, "soft")] if tied > 1 else [name]
 
 
 def list_notes(sweep: Sweep, best: Run | None) -> list[str]:
@@ -128,11 +110,9 @@ def list_notes(sweep: Sweep, best: Run | None) -> list[str]:
     open_ended = [folder for folder in sweep.unfinished if folder not in causes]
     notes = [f"Without a result: {', '.join(open_ended)}."] if open_ended else []
     notes += [f"Failed: {folder}: {cause}" for folder, cause in causes.items()]
-    return (
-        notes
-        if best
-        else [*notes, "The runs themselves are not there: numbers are those of summary.csv."]
-    )
+    if not best:
+        notes.append("The runs themselves are not there: numbers are those of summary.csv.")
+    return notes
 
 
 def tabulate_groups(
@@ -148,15 +128,10 @@ def tabulate_groups(
         for group in found
     ]
     head = [*sweep.shown, "runs", *(info.title for info in infos)]
-    say = (
-        "The best is marked. Where there are several seeds: mean ± standard deviation of the "
-        "sample."
-    )
+    several = "Where there are several seeds: mean ± standard deviation of the sample."
     numeric = range(len(sweep.shown), len(head))
-    return [
-        Paragraph([say]),
-        Table(head, rows, numeric, marked=find_best_group(found), form="sweep"),
-    ]
+    table = Table(head, rows, numeric, marked=find_best_group(found), form="sweep")
+    return [Paragraph([f"The best is marked. {several}"]), table]
 
 
 def format_mean(values: Sequence[float], info: MetricInfo) -> str:
@@ -171,16 +146,8 @@ def note_seeds(found: Sequence[Group]) -> list[Block]:
     """Return a caveat where every setting was run with one seed: two numbers are no trend."""
     if any(len(group.jobs) > 1 for group in found):
         return []
-    return [
-        Paragraph(
-            [
-                Text(
-                    "One seed each: differences may be chance. Add seed=0,1,2 to the sweep to see.",
-                    "soft",
-                )
-            ]
-        )
-    ]
+    said = "One seed each: differences may be chance. Add seed=0,1,2 to the sweep to see."
+    return [Paragraph([Text(said, "soft")])]
 
 
 def tabulate_seeds(found: Sequence[Group], infos: Sequence[MetricInfo]) -> list[Block]:
@@ -234,9 +201,5 @@ def list_jobs(sweep: Sweep, infos: Sequence[MetricInfo]) -> list[Block]:
         for job in sweep.jobs
     ]
     head = [*sweep.axes, *(info.title for info in infos)]
-    return [
-        Fold(
-            f"All {len(rows)} runs",
-            [Table(head, rows, range(len(sweep.axes), len(head)), form="sweep")],
-        )
-    ]
+    table = Table(head, rows, range(len(sweep.axes), len(head)), form="sweep")
+    return [Fold(f"All {len(rows)} runs", [table])]

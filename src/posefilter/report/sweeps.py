@@ -78,22 +78,15 @@ def read_sweep(folder: Path) -> Sweep:
     marks = ("metrics.json", "failed.json")
     found = sorted({path.parent for mark in marks for path in folder.rglob(mark)} - {folder})
     if not found and not any((folder / mark).is_file() for mark in SWEEP_MARKS):
-        kind = (
-            "is a run's folder; give it as run=" + str(folder)
-            if (folder / ".hydra").is_dir()
-            else "is no sweep's folder"
-        )
+        own = (folder / ".hydra").is_dir()
+        kind = f"is a run's folder; give it as run={folder}" if own else "is no sweep's folder"
         raise UserError(
             f"sweep={folder}: {kind} (no run with a metrics.json below it, no "
             f"multirun.yaml, no summary.csv)"
         )
     started = sorted(path.parent.parent for path in folder.rglob(".hydra/overrides.yaml"))
-    without = {path for path in found if (path / "failed.json").is_file()}
-    unfinished = [
-        str(path.relative_to(folder))
-        for path in started
-        if path not in {*found} - without and path != folder
-    ]
+    done = {path for path in found if not (path / "failed.json").is_file()}
+    unfinished = [str(p.relative_to(folder)) for p in started if p not in {*done, folder}]
     if found:
         axes, jobs = read_jobs(folder, found)
     elif (folder / "summary.csv").is_file():
@@ -108,13 +101,9 @@ def read_sweep(folder: Path) -> Sweep:
 
 def read_jobs(folder: Path, found: Sequence[Path]) -> tuple[list[str], list[Job]]:
     """Return the settings in which runs differ, and the runs."""
-    metrics = [
-        read_json(path / "failed.json") or read_json(path / "metrics.json") for path in found
-    ]
-    settings = [
-        dict(o.lstrip("+~").split("=", 1) for o in read_texts(own, "overrides", path) if "=" in o)
-        for path, own in zip(found, metrics, strict=True)
-    ]
+    metrics = [read_json(p / "failed.json") or read_json(p / "metrics.json") for p in found]
+    overrides = [read_texts(own, "overrides", p) for p, own in zip(found, metrics, strict=True)]
+    settings = [dict(o.lstrip("+~").split("=", 1) for o in own if "=" in o) for own in overrides]
     keys = dict.fromkeys(key for pairs in settings for key in pairs)
     declared = read_declared(folder)
     axes = [
@@ -123,22 +112,18 @@ def read_jobs(folder: Path, found: Sequence[Path]) -> tuple[list[str], list[Job]
         if (key not in SILENT or len(declared.get(key, [])) > 1)
         and len({pairs.get(key) for pairs in settings}) > 1
     ]
-    jobs = [
-        Job(
-            {axis: parse_number(pairs.get(axis, "default")) for axis in axes},
-            list_numbers(own),
-            str(path.relative_to(folder)),
-            str(own.get("error") or ""),
-        )
-        for path, own, pairs in zip(found, metrics, settings, strict=True)
-    ]
+    jobs = []
+    for path, own, pairs in zip(found, metrics, settings, strict=True):
+        place = {axis: parse_number(pairs.get(axis, "default")) for axis in axes}
+        name, error = str(path.relative_to(folder)), str(own.get("error") or "")
+        jobs.append(Job(place, list_numbers(own), name, error))
     return axes, jobs
 
 
 def read_jobs_from_csv(path: Path) -> tuple[list[str], list[Job]]:
     """Return the same of a summary: columns of no known figure are axes."""
     try:
-        with path.open(newline="") as file:
+        with path.open(newline="", encoding="utf-8") as file:
             rows = list(csv.DictReader(file, restval=""))
     except (csv.Error, ValueError) as error:
         raise UserError(f"{path}: is no table of runs ({error})") from error
@@ -148,15 +133,10 @@ def read_jobs_from_csv(path: Path) -> tuple[list[str], list[Job]]:
         raise UserError(f"{path}: has no row")
     jobs = []
     for row in rows:
-        figures = {
-            name: parse_number(row[column]) for column, name in COLUMNS.items() if row.get(column)
-        }
-        numbers = {
-            name: float(value) for name, value in figures.items() if not isinstance(value, str)
-        }
-        jobs.append(
-            Job({axis: parse_number(row[axis]) for axis in axes}, numbers, row.get("folder") or "")
-        )
+        figures = {name: parse_number(row.get(column) or "") for column, name in COLUMNS.items()}
+        numbers = {name: float(x) for name, x in figures.items() if not isinstance(x, str)}
+        place = {axis: parse_number(row[axis]) for axis in axes}
+        jobs.append(Job(place, numbers, row.get("folder") or ""))
     return axes, jobs
 
 
