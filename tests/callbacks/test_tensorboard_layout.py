@@ -7,6 +7,7 @@ from typing import Any
 
 import torch
 from lightning.pytorch.loggers import TensorBoardLogger
+from omegaconf import OmegaConf
 from tensorboard.backend.event_processing.data_provider import MultiplexerDataProvider
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from tensorboard.backend.event_processing.plugin_event_multiplexer import EventMultiplexer
@@ -55,6 +56,8 @@ def test_settings_and_metrics_are_read_back(tmp_path: Path) -> None:
     assert start["filter.particles"].number_value == 50
     assert start["refine"].string_value == "gradient"
     assert start["data.settle"].string_value == "false"
+    told = OmegaConf.load(tmp_path / "hparams.yaml")
+    assert told == {"refine": "gradient", "filter.particles": 50, "data.settle": False, "seed": 0}
     assert [e.value for e in board.Scalars("val/best_score")] == [40.0, 40.0]
     assert set(board.Tags()["scalars"]) - {"hp_metric"} == {"val/best_score"}
 

@@ -75,8 +75,12 @@ def post_image(
 
 def get_writers(trainer: Trainer) -> list[FileWriter]:
     """Return the writers of the trainer's TensorBoards."""
-    boards = [logger for logger in trainer.loggers if isinstance(logger, TensorBoardLogger)]
-    return [board.experiment._get_file_writer() for board in boards]
+    return [board.experiment._get_file_writer() for board in get_boards(trainer)]
+
+
+def get_boards(trainer: Trainer) -> list[TensorBoardLogger]:
+    """Return the trainer's TensorBoards."""
+    return [logger for logger in trainer.loggers if isinstance(logger, TensorBoardLogger)]
 
 
 class Budget:

@@ -24,7 +24,7 @@ from tensorboard.plugins.hparams.plugin_data_pb2 import HParamsPluginData
 from tensorboard.plugins.hparams.summary_v2 import hparams_pb
 from torch.utils.tensorboard.summary import custom_scalars
 
-from posefilter.callbacks.tensorboard import get_writers
+from posefilter.callbacks.tensorboard import get_boards, get_writers
 from posefilter.metrics.registry import find_metric
 
 Setting = bool | int | float | str
@@ -113,6 +113,8 @@ class TensorBoardLayout(Callback):
         """Write layout and settings."""
         if not trainer.is_global_zero:
             return
+        for board in get_boards(trainer):
+            board.hparams.update(self.settings)  # which Lightning writes to hparams.yaml
         layout = {
             category: {title: ("Multiline", tags) for title, tags in charts.items()}
             for category, charts in LAYOUT.items()

@@ -41,7 +41,7 @@ def _count(root: Path) -> tuple[int, int]:
     if frames == 0 or not (root / _MARK).is_file():
         return frames, frames
     try:
-        return frames, int(json.loads((root / _MARK).read_text())["frames"])
+        return frames, int(json.loads((root / _MARK).read_bytes())["frames"])
     except (OSError, KeyError, TypeError, ValueError) as error:
         raise UserError(
             f"{root / _MARK}: not a generator's record ({error}); delete the folder to render it "

@@ -29,7 +29,7 @@ class VideoWriter:
 
     def __init__(self, path: Path, form: str, fps: float) -> None:
         self.path, self.form, self.fps = path.with_name(f"{path.name}.{form}"), form, fps
-        os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # likewise, of FFmpeg's
+        os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # nothing of FFmpeg's own
         self._part = path.with_name(f".{path.name}.{os.getpid()}.part.mp4")
         self._writer: cv2.VideoWriter | None = None
         self._count = 0

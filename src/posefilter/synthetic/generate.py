@@ -284,7 +284,7 @@ def _open_dataset(out: Path, job: Job, frames: int) -> None:
     path = out / GENERATOR
     if path.is_file():
         try:
-            record = json.loads(path.read_text())
+            record = json.loads(path.read_bytes())
             there, before = _with_defaults(record["settings"]), int(record["frames"])
         except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
             raise UserError(
