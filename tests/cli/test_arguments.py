@@ -51,6 +51,21 @@ def test_a_setting_that_no_job_has_is_refused_with_the_nearest(
 @pytest.mark.parametrize(
     ("typed", "told"),
     [
+        ("particles=50", "particles: there is no such setting; did you mean 'filter.particles' or"),
+        ("filter.lr=1", "filter.lr: there is no such setting; did you mean 'optimizer.lr'?"),
+        ("filter.particel=5", "there is no such setting; did you mean 'filter.particles'?"),
+    ],
+)
+def test_a_setting_in_the_wrong_place_is_told_its_place(
+    typed: str, told: str, capfd: pytest.CaptureFixture[str]
+) -> None:
+    assert run_command("train", HOME, [typed]) == 2
+    assert told in capfd.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("typed", "told"),
+    [
         ("tracker={rounds: 2}", "tracker.rounds: is now tracker.quadratic_fits"),
         ("tracker.motion={momentum: 1}", "tracker.motion.momentum: is now tracker.motion.vel"),
         ("tracker={patiense: 2}", "tracker.patiense: there is no such setting; did you mean"),
@@ -273,3 +288,13 @@ def test_bags_at_home_are_places() -> None:
 def test_a_choice_that_is_typed_as_a_setting_is_told_by_todays_name() -> None:
     with pytest.raises(UserError, match=r"type filter/resample=adaptive$"):
         check_choices(["filter.resample=below_ess"], HOME / "conf")
+
+
+def test_a_setting_that_nothing_reads_cannot_be_added() -> None:
+    conf = HOME / "conf"
+    with pytest.raises(UserError, match=r"\+sed: nothing reads .* without \+"):
+        check_choices(["+sed=1"], conf, "train")
+    with pytest.raises(UserError, match=r"\+foo: nothing reads"):
+        check_choices(["debug=smoke", "++foo=1"], conf, "train")
+    for taken in ("+experiment=memorize", "++seed=1", "+filter.own=1", "+plugins=[own]"):
+        check_choices([taken], conf, "train")

@@ -99,8 +99,8 @@ def particles(o: Occasion) -> Drawn:
 @needs("pose")
 def belief(o: Occasion) -> Drawn:
     """Draw the belief on SO(3) and over translation."""
-    known = (o.trace.belief, o.method.object_model, o.one.truth)
-    return draw_belief(o.one.rgb, o.one.intrinsics, *known, o.title("Belief"))
+    model, truth, title = o.method.object_model, o.one.truth, o.title("Belief")
+    return draw_belief(o.one.rgb, o.one.intrinsics, o.trace.belief, model, truth, title)
 
 
 @needs("pose_space")
@@ -132,9 +132,9 @@ def points(o: Occasion) -> Drawn:
     """
     likelihood = cast(ScoresPoints, o.method.likelihood)
     object_model, truth = o.method.object_model, o.batch.camera_from_object[0]
-    of, levels = (likelihood, o.encoding.image, truth, object_model), choose_levels(o.trace.steps)
+    image, levels = o.encoding.image, choose_levels(o.trace.steps)
     slices = [
-        evaluate_point_field(*of, pixel, on, levels, depthwise)
+        evaluate_point_field(likelihood, image, truth, object_model, pixel, on, levels, depthwise)
         for pixel, on in choose_pixels(o.batch, object_model)
         for depthwise in ((False, True) if on else (False,))
     ]
@@ -151,8 +151,9 @@ def proposals(o: Occasion) -> Drawn:
     predicted = predict_proposals(o.method, o.encoding, o.batch, o.method.object_model)
     if predicted is None:
         return None
-    image, radius = (o.one.rgb, o.one.intrinsics, o.one.truth), o.method.object_model.radius
-    return draw_proposals(predicted, *image, o.shape, radius, o.title("Proposals"))
+    rgb, K, truth = o.one.rgb, o.one.intrinsics, o.one.truth
+    radius, title = o.method.object_model.radius, o.title("Proposals")
+    return draw_proposals(predicted, rgb, K, truth, o.shape, radius, title)
 
 
 @needs("pixel_space")

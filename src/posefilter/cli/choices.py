@@ -7,6 +7,8 @@ from collections.abc import Sequence
 from itertools import pairwise, product
 from pathlib import Path
 
+import yaml
+
 from posefilter.cli.instantiate import hint
 from posefilter.cli.renamed import rename
 from posefilter.cli.trust import find_folders, named, trusted
@@ -32,6 +34,10 @@ def check_choices(arguments: list[str], conf: Path, command: str | None = None) 
             options = list_choices(conf / group)
             there = f"there are {', '.join(options)}" if options else f"see conf/{group}"
             raise UserError(f"{group}={value}: takes the name of a choice, not a value; {there}")
+        if command and re.fullmatch(r"\+{1,2}\w+", key):
+            check_added(
+                key.lstrip("+"), conf / f"{command}.yaml", [conf, *choice_folders(arguments)]
+            )
         if key == "preset" and value != "null":
             check_preset(value, [conf, *choice_folders(arguments)])
         now = (
@@ -43,6 +49,18 @@ def check_choices(arguments: list[str], conf: Path, command: str | None = None) 
             raise UserError(f"{argument}: is now {now}")
     check_variants(arguments, conf)
     check_names([conf, *find_folders(named()), *config_folders(arguments)])
+
+
+def check_added(key: str, settings: Path, folders: Sequence[Path]) -> None:
+    """Raise UserError where a key is added at the top that is neither a setting of the command nor
+    a group: nothing would read it.
+    """
+    groups = [path.name for folder in folders for path in folder.iterdir() if path.is_dir()]
+    if key not in (*yaml.safe_load(settings.read_text(encoding="utf-8")), *groups):
+        raise UserError(
+            f"+{key}: nothing reads a setting of this name; typed without + it is looked for among "
+            "those that there are"
+        )
 
 
 def check_names(folders: Sequence[Path]) -> None:

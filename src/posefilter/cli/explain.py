@@ -119,7 +119,12 @@ def first_line(error: BaseException) -> str:
 
 
 def near(wrong: str, known: list[str]) -> str:
-    """Return the nearest key of the same depth; else what the wrong key's section has."""
+    """Return keys of the same last name; else the nearest of the same depth; else what the wrong
+    key's section has.
+    """
+    elsewhere = [key for key in known if re.split("[./]", key)[-1] == wrong.rpartition(".")[2]]
+    if elsewhere:
+        return f"; did you mean {' or '.join(repr(key) for key in elsewhere[:2])}?"
     told = hint(wrong, [key for key in known if key.count(".") == wrong.count(".")])
     section = wrong.rpartition(".")[0]
     if told or section not in known:

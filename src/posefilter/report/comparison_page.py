@@ -202,8 +202,18 @@ def chart_pairs(pairs: Sequence[Pair], names: tuple[str, str]) -> list[Panel]:
         return []
     least, most = (f(row.add_mm for pair in both for row in pair) for f in (min, max))
     dots = Line("an image", [pair.a.add_mm for pair in both], [pair.b.add_mm for pair in both])
-    axes = (f"ADD of {names[1]}", f"ADD of {names[0]} [mm]", "mm")
-    return [Panel(*axes, [dots], joined=False, log_x=True, log_y=True, diagonal=(least, most))]
+    return [
+        Panel(
+            title=f"ADD of {names[1]}",
+            xlabel=f"ADD of {names[0]} [mm]",
+            unit="mm",
+            lines=[dots],
+            joined=False,
+            log_x=True,
+            log_y=True,
+            diagonal=(least, most),
+        )
+    ]
 
 
 def list_changes_of_images(pairs: Sequence[Pair], names: tuple[str, str]) -> list[Block]:

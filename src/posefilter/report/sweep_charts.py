@@ -33,9 +33,19 @@ def chart_over(
     out = []
     for info in infos:
         lines = [line_over(axis, spots, found, info, kind) for kind in kinds]
-        shown = [line for line in lines if len(line.x)]
-        axes = (info.label, axis, info.unit, shown, info.limits, categories, log_x)
-        out += [Panel(*axes, ticks=ticks)] if shown else []
+        if shown := [line for line in lines if len(line.x)]:
+            out.append(
+                Panel(
+                    info.label,
+                    axis,
+                    info.unit,
+                    shown,
+                    info.limits,
+                    categories,
+                    log_x,
+                    ticks=ticks,
+                )
+            )
     return out
 
 
