@@ -18,6 +18,7 @@ from posefilter.cli.arguments import (
 )
 from posefilter.cli.choices import check_added, check_choices
 from posefilter.cli.command import compose_config
+from posefilter.cli.explain import near
 from posefilter.cli.job import Job
 from posefilter.errors import MISTAKE, UserError
 
@@ -62,6 +63,12 @@ def test_a_setting_in_the_wrong_place_is_told_its_place(
 ) -> None:
     assert run_command("train", HOME, [typed]) == 2
     assert told in capfd.readouterr().err
+
+
+def test_of_many_settings_of_one_name_those_are_told_that_are_typed_alike() -> None:
+    known = ["data.width", "model.encoder.width", "model.pose_head.width", "model.net.width"]
+    told = "; did you mean 'model.net.width' or 'model.encoder.width'?"
+    assert near("modle.net.width", known) == told
 
 
 @pytest.mark.parametrize(
