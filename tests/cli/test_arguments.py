@@ -16,9 +16,11 @@ from posefilter.cli.arguments import (
     told_apart,
     with_home,
 )
-from posefilter.cli.choices import check_choices
+from posefilter.cli.choices import check_added, check_choices
+from posefilter.cli.command import compose_config
+from posefilter.cli.explain import near
 from posefilter.cli.job import Job
-from posefilter.errors import UserError
+from posefilter.errors import MISTAKE, UserError
 
 HOME = Path(__file__).parents[2]
 
@@ -61,6 +63,12 @@ def test_a_setting_in_the_wrong_place_is_told_its_place(
 ) -> None:
     assert run_command("train", HOME, [typed]) == 2
     assert told in capfd.readouterr().err
+
+
+def test_of_many_settings_of_one_name_those_are_told_that_are_typed_alike() -> None:
+    known = ["data.width", "model.encoder.width", "model.pose_head.width", "model.net.width"]
+    told = "; did you mean 'model.net.width' or 'model.encoder.width'?"
+    assert near("modle.net.width", known) == told
 
 
 @pytest.mark.parametrize(
@@ -293,8 +301,32 @@ def test_a_choice_that_is_typed_as_a_setting_is_told_by_todays_name() -> None:
 def test_a_setting_that_nothing_reads_cannot_be_added() -> None:
     conf = HOME / "conf"
     with pytest.raises(UserError, match=r"\+sed: nothing reads .* without \+"):
-        check_choices(["+sed=1"], conf, "train")
+        check_added(["+sed=1"], conf, "train")
     with pytest.raises(UserError, match=r"\+foo: nothing reads"):
-        check_choices(["debug=smoke", "++foo=1"], conf, "train")
+        check_added(["debug=smoke", "++foo=1"], conf, "train")
+    with pytest.raises(UserError, match=r"\+foo: nothing reads"):
+        compose_config("train", ["+foo=1"])
     for taken in ("+experiment=memorize", "++seed=1", "+filter.own=1", "+plugins=[own]"):
-        check_choices([taken], conf, "train")
+        check_added([taken], conf, "train")
+
+
+def test_a_setting_that_an_interpolation_reads_can_be_added(tmp_path: Path) -> None:
+    conf = HOME / "conf"
+    # of conf/loss/aux/displacement, where that is chosen
+    check_added(["-m", "model=pose_pf,patch_pf", "++margin_px=3"], conf, "train")
+    check_added(["-m", "+n=50,100", "filter.particles=${n}"], conf, "train")
+    check_added(["+n=9"], conf, "train", ["filter.steps=${n}", "+n=9"])  # of a resumed run
+    (tmp_path / "loss").mkdir()
+    (tmp_path / "loss" / "own.yaml").write_text("width: ${own_width}\n")
+    check_added(["--config-dir", str(tmp_path), "+own_width=3"], conf, "train")
+
+
+def test_a_run_goes_on_that_was_begun_with_a_setting_that_nothing_reads(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    record = tmp_path / ".hydra" / "overrides.yaml"
+    for file in (record, tmp_path / "checkpoints" / "last.ckpt"):
+        file.parent.mkdir()
+        file.write_text("[+note=first, trainer.max_steps=0]")
+    assert run_command("train", HOME, [f"resume={tmp_path}"]) == MISTAKE
+    assert "trainer.max_steps" in capsys.readouterr().err  # and not of the note

@@ -13,6 +13,7 @@ from posefilter.cli.check_data import check_data
 from posefilter.cli.command import FAILURE, compose_job, run_command
 from posefilter.cli.evaluate import data_settings
 from posefilter.cli.generate import generate
+from posefilter.cli.plain import to_plain
 from posefilter.errors import ProblemsFound, UserError
 
 HOME = Path(__file__).parents[2]
@@ -64,6 +65,15 @@ def test_a_split_that_is_no_mapping_is_refused_in_words(tmp_path: Path) -> None:
         UserError, match=r"data\.split='half': must be a mapping such as .* or null"
     ):
         build_data(compose_job("train", CONF, asked, tmp_path).cfg.data, "json")
+
+
+def test_options_of_a_reader_that_are_no_mapping_are_refused_in_words(tmp_path: Path) -> None:
+    (tmp_path / "x").touch()
+    typed = ["data=bop", f"data.root={tmp_path}", "data.object=obj_000001"]
+    own = to_plain(compose_job("train", CONF, typed, tmp_path).cfg)
+    job = compose_job("evaluate", CONF, [*typed, "data.options=3"], tmp_path)
+    with pytest.raises(UserError, match=r"data\.options=3: must be a mapping"):
+        build_data(data_settings(job, own, "obj_000001"), "json")
 
 
 @pytest.mark.parametrize("chosen", [["data=bop"], []])

@@ -25,7 +25,7 @@ from dataset_trees import (
 )
 from torch.utils.data import default_collate
 
-from posefilter.data.augmentation import RandomCrop
+from posefilter.data.augmentation import PasteOccluder, RandomCrop
 from posefilter.data.dataset import EpochShuffle
 from posefilter.data.loaders import spare_cores
 from posefilter.data.module import PoseDataModule
@@ -323,6 +323,11 @@ def test_images_of_several_sizes_are_taken_one_by_one(root, tmp_path):
     cut = partial(PoseDataModule, **how, split={"train": 1.0}, augment=RandomCrop((32, 32)))
     (batch,) = cut(batch_size=2, workers=0).train_dataloader()
     assert batch.rgb.shape == (2, 3, 32, 32)
+    paste = PasteOccluder(probability=1, keep=0)
+    for seed in range(8):  # it draws from one of the other size in some
+        dm = PoseDataModule(**how, split={"train": 1.0}, augment=paste, batch_size=2, seed=seed)
+        with pytest.raises(UserError, match="of one size"):
+            dm.train_dataloader()
 
 
 def test_validation_and_test_are_not_augmented(root):

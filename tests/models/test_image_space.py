@@ -7,6 +7,7 @@ from typing import Any
 
 import pytest
 import torch
+from lightning import Trainer
 from torch import nn
 
 sys.path.insert(0, str(Path(__file__).parent))
@@ -28,6 +29,7 @@ from posefilter.labels.membership import OnObject, Quality
 from posefilter.losses.displacement import Chamfer, DirectDisplacement, Sides
 from posefilter.losses.likelihood import BalancedBce, Bce
 from posefilter.losses.pose_loss import Add, Confidence, SurfacePointLoss
+from posefilter.models.base import with_lightning
 from posefilter.models.box_heads import PoseBox, QuantileBox, VotedBox
 from posefilter.models.cnn_patch import CnnPatch
 from posefilter.models.downsized import Downsized
@@ -238,6 +240,21 @@ def test_particles_start_and_are_resampled_where_the_objectness_is() -> None:
     assert share(UniformPixels(), AuxiliaryResampling(Systematic()))[1] > uniform[1]
     with pytest.raises(UserError, match="objectness"):
         paper(PatchPF, 3, filter=run_filter(8, 2, FromObjectness()))
+
+
+def test_a_method_knows_its_trainer_while_it_measures_in_training() -> None:
+    seen = []
+
+    class Annealed(PixelPF):
+        def measure(self, *arguments: Any) -> Any:
+            seen.append(self.trainer)
+            return super().measure(*arguments)
+
+    method = working(with_lightning(Annealed), 1)
+    method._trainer = trainer = Trainer(logger=False, enable_checkpointing=False)
+    method.training_losses(scenes(2), torch.Generator().manual_seed(0))
+    assert seen
+    assert all(one is trainer for one in seen)
 
 
 def test_stages_change_the_weights_as_training_proceeds() -> None:

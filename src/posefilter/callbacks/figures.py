@@ -96,8 +96,9 @@ class Figures(TraceCallback):
             name = name_frame(trainer, "val", int(batch.frame_id[i]))
             self._selection.offer(error, partial(keep_image, trace, batch, method, i, error, name))
             if self._example is None:
-                one, own = keep_image(trace, batch, method, i, error, name), select_image(trace, 0)
-                self._example = (one, own, Batch(*(x[:1].clone() for x in batch)))
+                one = keep_image(trace, batch, method, i, error, name)
+                alone = Batch(*(x[:1].clone() for x in batch))
+                self._example = (one, select_image(trace, 0), alone)
 
     def on_validation_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Draw, or put it off."""

@@ -83,19 +83,19 @@ def likely_causes(views: Sequence[View], geometry: Geometry, before: float) -> l
     """Return in words what is probably wrong with poses, frames, intrinsics and depth; `before`:
     the median IoU as it is.
     """
-    tried = zip(*map(list_causes, views), strict=True)  # a cause, of each view
-    fits = [
-        [compare(view, geometry, *undone[1:]) for view, undone in zip(views, cause, strict=True)]
-        for cause in tried
-    ]
+    undone = [list_causes(view) for view in views]
+    words = [one[0] for one in undone[0]]
+    fits = []
+    for number in range(len(words)):
+        own = [(view, *causes[number][1:]) for view, causes in zip(views, undone, strict=True)]
+        fits.append([compare(view, geometry, pose, K) for view, pose, K in own])
     scores = [float(np.median([fit.iou for fit in each])) for each in fits]
     best = int(np.argmax(scores))
     as_read = [compare(view, geometry) for view in views]
     found, judged = [], as_read
     if scores[best] > before + max(0.05, 0.5 * (1 - before)) and scores[best] > 0.7:
         found.append(
-            f"{list_causes(views[0])[best][0]} (silhouette IoU {before:.2f}, with that undone "
-            f"{scores[best]:.2f})"
+            f"{words[best]} (silhouette IoU {before:.2f}, with that undone {scores[best]:.2f})"
         )
         judged = fits[best]
     return found + _depth_scale(judged)

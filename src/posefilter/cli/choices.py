@@ -34,10 +34,6 @@ def check_choices(arguments: list[str], conf: Path, command: str | None = None) 
             options = list_choices(conf / group)
             there = f"there are {', '.join(options)}" if options else f"see conf/{group}"
             raise UserError(f"{group}={value}: takes the name of a choice, not a value; {there}")
-        if command and re.fullmatch(r"\+{1,2}\w+", key):
-            check_added(
-                key.lstrip("+"), conf / f"{command}.yaml", [conf, *choice_folders(arguments)]
-            )
         if key == "preset" and value != "null":
             check_preset(value, [conf, *choice_folders(arguments)])
         now = (
@@ -51,16 +47,34 @@ def check_choices(arguments: list[str], conf: Path, command: str | None = None) 
     check_names([conf, *find_folders(named()), *config_folders(arguments)])
 
 
-def check_added(key: str, settings: Path, folders: Sequence[Path]) -> None:
-    """Raise UserError where a key is added at the top that is neither a setting of the command nor
-    a group: nothing would read it.
+def check_added(
+    typed: Sequence[str], conf: Path, command: str, arguments: Sequence[str] = ()
+) -> None:
+    """Raise UserError where a setting is added at the top that nothing would read: neither the
+    command, nor an interpolation, nor is it a group.
+
+    Args:
+        typed: What is typed.
+        conf: The folder of settings.
+        command: The command's name.
+        arguments: All that the command is given, the settings of a resumed run too.
     """
-    groups = [path.name for folder in folders for path in folder.iterdir() if path.is_dir()]
-    if key not in (*yaml.safe_load(settings.read_text(encoding="utf-8")), *groups):
-        raise UserError(
-            f"+{key}: nothing reads a setting of this name; typed without + it is looked for among "
-            "those that there are"
-        )
+    added = [one.partition("=")[0].lstrip("+") for one in typed if re.match(r"\+{1,2}\w+=", one)]
+    if not added:
+        return
+    folders = [conf, *choice_folders(typed)]
+    settings = yaml.safe_load((conf / f"{command}.yaml").read_text(encoding="utf-8"))
+    chosen = {name for one in settings["defaults"] if isinstance(one, dict) for name in one}
+    groups = {path.name for folder in folders for path in folder.glob("*") if path.is_dir()}
+    files = (file for folder in folders for file in folder.glob("*/**/*.yaml"))
+    text = "\n".join([*typed, *arguments, *(file.read_text(encoding="utf-8") for file in files)])
+    for key in added:
+        is_referred_to = re.search(rf"\$\{{(oc\.select:)?{key}[.,}}]", text)
+        if not (key in {*settings, *chosen, *groups} or is_referred_to):
+            raise UserError(
+                f"+{key}: nothing reads a setting of this name; typed without + it is looked for "
+                "among those that there are"
+            )
 
 
 def check_names(folders: Sequence[Path]) -> None:

@@ -30,7 +30,7 @@ from posefilter.cli.arguments import (
     without_deletion,
     without_trace,
 )
-from posefilter.cli.choices import check_choices, typed_plugins
+from posefilter.cli.choices import check_added, check_choices, typed_plugins
 from posefilter.cli.components import loosen
 from posefilter.cli.console import logging_for
 from posefilter.cli.explain import explain, explain_hydra, is_launchers
@@ -99,8 +99,9 @@ def run_command(name: str, home: Path | None = None, arguments: list[str] | None
             raise UserError("--cfg shows the settings of one job; leave -m out")
         arguments = bracketed(arguments)
         record = keep_record(arguments)
-        arguments = with_resumed(arguments)
+        typed, arguments = arguments, with_resumed(arguments)
         check_choices(arguments, conf, name)  # a resumed run's too
+        check_added(typed, conf, name, arguments)
         arguments = quoted(loosen(arguments, name)) + logging_for(arguments)
         arguments = told_apart(maximized(options_first(arguments)), name, conf)
         sys.argv = [sys.argv[0], *defer_settings(arguments, conf)]
@@ -193,6 +194,7 @@ def compose_config(name: str, overrides: list[str]) -> DictConfig:
         raise UserError(f"command={name}: there is none; choose {', '.join(COMMANDS)}")
     try:
         check_choices(overrides, conf, name)
+        check_added(overrides, conf, name)
         job = compose_job(name, conf, loosen(bracketed(overrides), name), Path())
         if name == "train":
             check_fit(job.cfg, job.choices, Scope.CONFIG)

@@ -298,7 +298,8 @@ def data_settings(
 
 def _bop_split(data: Mapping[str, Any]) -> Any:
     """Return which folder of a dataset in BOP's layout is read, such as train_pbr."""
-    return (data.get("options") or {}).get("split")
+    options = data.get("options")
+    return options.get("split") if isinstance(options, Mapping) else None
 
 
 def object_to_judge(data: PoseDataModule, own: ObjectModel) -> ObjectModel:

@@ -1,5 +1,6 @@
 """From a mistake in a command line to one readable line."""
 
+import difflib
 import re
 import shlex
 import traceback
@@ -119,12 +120,13 @@ def first_line(error: BaseException) -> str:
 
 
 def near(wrong: str, known: list[str]) -> str:
-    """Return keys of the same last name; else the nearest of the same depth; else what the wrong
-    key's section has.
+    """Return the nearest keys of the same last name; else the nearest of the same depth; else what
+    the wrong key's section has.
     """
     elsewhere = [key for key in known if re.split("[./]", key)[-1] == wrong.rpartition(".")[2]]
     if elsewhere:
-        return f"; did you mean {' or '.join(repr(key) for key in elsewhere[:2])}?"
+        nearest = difflib.get_close_matches(wrong, elsewhere, n=2, cutoff=0)
+        return f"; did you mean {' or '.join(map(repr, nearest))}?"
     told = hint(wrong, [key for key in known if key.count(".") == wrong.count(".")])
     section = wrong.rpartition(".")[0]
     if told or section not in known:

@@ -342,10 +342,15 @@ def evaluate(work: Onboarding) -> None:
 
 def report(work: Onboarding) -> None:
     """Write the page."""
-    record, stages = read_run(work.training), work.stages
-    command = typed("onboard", mesh=work.cfg.mesh, out=work.out)
-    found = (stages.values, stages.seconds, work.out / "symmetries.png")
-    page = make_onboarding_page(record, compared(record), command, *found)
+    record = read_run(work.training)
+    page = make_onboarding_page(
+        record,
+        compared(record),
+        typed("onboard", mesh=work.cfg.mesh, out=work.out),
+        work.stages.values,
+        work.stages.seconds,
+        work.out / "symmetries.png",
+    )
     folder = work.out / "report"
     write_whole(folder / "report.html", page.render())
     for name, png in page.files().items():

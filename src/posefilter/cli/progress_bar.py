@@ -149,9 +149,14 @@ class Bars(Callback):
 
     def _shown(self) -> Progress:
         if self._bars is None:
-            name, said = TextColumn("{task.description}"), TextColumn("[dim]{task.fields[said]}")
-            times = TimeElapsedColumn(), TimeRemainingColumn()
-            self._bars = Progress(name, BarColumn(24), MofNCompleteColumn(), *times, said)
+            self._bars = Progress(
+                TextColumn("{task.description}"),
+                BarColumn(24),
+                MofNCompleteColumn(),
+                TimeElapsedColumn(),
+                TimeRemainingColumn(),
+                TextColumn("[dim]{task.fields[said]}"),
+            )
             self._bars.start()
         return self._bars
 

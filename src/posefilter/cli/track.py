@@ -222,9 +222,10 @@ def list_seen(results: Sequence[TrackResult]) -> list[Seen]:
     """Return the objects of a frame as the 3-D view takes them."""
     seen = []
     for one in results:
-        pose, center = one.pose if one.is_tracked else None, one.object_model.center
+        pose = one.pose if one.is_tracked else None
+        center = one.object_model.center.cpu().double().numpy()
         presence = float("nan") if one.presence is None else float(one.presence)
-        seen.append(Seen(one.object, pose, center.cpu().double().numpy(), presence))
+        seen.append(Seen(one.object, pose, center, presence))
     return seen
 
 

@@ -81,8 +81,9 @@ def build(job: Job) -> Run:
     method.set_object(object_model)
     if job.cfg.warm_start:
         starts = read_starts(job.cfg.warm_start, object_model.name)
-        told = (job.cfg.warm_start, len(starts), *warm_start(method, starts))
-        log.info("warm start from %s (%d files): %d tensors copied, %d left as drawn", *told)
+        copied, left = warm_start(method, starts)
+        said = "warm start from %s (%d files): %d tensors copied, %d left as drawn"
+        log.info(said, job.cfg.warm_start, len(starts), copied, left)
     rehearse(method, data)
     if not is_follower():
         write_json(job.folder / "data.json", {**data.describe(), "split": data.split_record()})

@@ -4,6 +4,7 @@ alone.
 
 import atexit
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 from typing import TYPE_CHECKING
 from weakref import WeakSet
 
@@ -75,8 +76,10 @@ class FrameDataset(Dataset[Batch]):
         one_of_each: dict[tuple[int, ...], int] = {
             one.shape: i for i, one in enumerate(kept) if one is not None
         }
-        if len(one_of_each) > 1:  # augmentation may cut them to one size
-            one_of_each = {tuple(self[i].rgb.shape[1:]): i for i in one_of_each.values()}
+        if len(one_of_each) > 1:
+            # augmentation may cut them to one size, or fail where it draws one of another size
+            with suppress(Exception):
+                one_of_each = {tuple(self[i].rgb.shape[1:]): i for i in one_of_each.values()}
         return {size: self.records[i].name for size, i in one_of_each.items()}
 
     def set_epoch(self, epoch: int) -> None:

@@ -27,8 +27,9 @@ def encode_gif(
     """Return frames as an animated GIF that loops, the one animation that TensorBoard plays; the
     last is held.
     """
+    free = colors - len(_KEPT)
     # as good for choosing colors, and nine times sooner
-    few, free = np.ascontiguousarray(frames[-1][::3, ::3]), colors - len(_KEPT)
+    few = np.ascontiguousarray(frames[-1][::3, ::3])
     ground = Image.fromarray(few).quantize(free, Image.Quantize.MEDIANCUT).getpalette() or []
     own = np.reshape(ground, (-1, 3))[:free]
     palette = np.concatenate([_KEPT, own]).astype(np.uint8)
@@ -43,9 +44,10 @@ def encode_gif(
         images[-1].putpalette(palette.tobytes())
     durations = [milliseconds] * (len(frames) - 1) + [hold]
     stream = BytesIO()
-    save: dict[str, Any] = {"save_all": True, "append_images": images[1:], "duration": durations}
-    save |= {"loop": 0, "transparency": colors, "disposal": 1, "optimize": False}
-    images[0].save(stream, "GIF", **save)
+    save: dict[str, Any] = {"loop": 0, "transparency": colors, "disposal": 1, "optimize": False}
+    images[0].save(
+        stream, "GIF", save_all=True, append_images=images[1:], duration=durations, **save
+    )
     return stream.getvalue()
 
 

@@ -47,6 +47,7 @@ def with_encoding(method: Any, encoding: Encoding) -> Any:
     not see what `__getattr__` would find.
     """
     out = copy(method)
+    vars(out).update(vars(method))  # with its trainer, which Lightning leaves out of copies
     out.encode = lambda batch: encoding
     return out
 

@@ -138,8 +138,10 @@ def draw_charts(panels: Sequence[Panel]) -> list[Charts]:
     for panel in panels:
         light, dark = draw_chart(panel, LIGHT), draw_chart(panel, DARK)
         file = f"{make_slug(panel.title)}-{make_slug(panel.xlabel)}.png"
-        uris, size = (encode_png(light), encode_png(dark)), (WIDTH_PX, measure_height(panel))
-        charts.append(Chart(*uris, *size, describe_panel(panel), file, light))
+        height, words = measure_height(panel), describe_panel(panel)
+        charts.append(
+            Chart(encode_png(light), encode_png(dark), WIDTH_PX, height, words, file, light)
+        )
     return [Charts(charts)] if charts else []
 
 

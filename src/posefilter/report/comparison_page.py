@@ -81,8 +81,12 @@ def read_two_runs(text: str) -> tuple[Run, Run]:
 
 def match_images(a: Sequence[ImageError], b: Sequence[ImageError]) -> list[Pair]:
     """Return the images that two tests share, by dataset name and ids, in the first one's order."""
-    others = {row[:5]: row for row in b}
-    return [Pair(row, others[row[:5]]) for row in a if row[:5] in others]
+
+    def identify(row: ImageError) -> tuple[str, int, int, int, str]:
+        return row.image, row.scene_id, row.im_id, row.obj_id, row.object
+
+    others = {identify(row): row for row in b}
+    return [Pair(row, others[identify(row)]) for row in a if identify(row) in others]
 
 
 def judge(pairs: Sequence[Pair]) -> Verdict:

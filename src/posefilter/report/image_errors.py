@@ -87,8 +87,8 @@ def chart_errors(runs: Mapping[str, Sequence[ImageError]]) -> list[Panel]:
             by_auc.append(Line(name, seen, [measure_auc(part) for part in parts]))
     out = [Panel("Images with an error below a threshold", "threshold [mm]", "%", cdf, PERCENT)]
     for lines, key in ((by_auc, "add/auc"), (by_share, "add/recall_01d")):
-        info, title = find_metric(key), f"{find_metric(key).label} by visibility"
-        out.append(Panel(title, "visible share", info.unit, lines, PERCENT))
+        info = find_metric(key)
+        out.append(Panel(f"{info.label} by visibility", "visible share", info.unit, lines, PERCENT))
     return [panel for panel in out if panel.lines]
 
 

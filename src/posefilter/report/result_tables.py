@@ -39,8 +39,9 @@ def compare_numbers(columns: Mapping[str, Mapping[str, Any]]) -> Table:
     rows: list[list[Cell]] = []
     for info in map(find_metric, ROWS):
         values = [read_number(metrics, info.key) for metrics in columns.values()]
-        cells = ["–" if value is None else info.describe(value) for value in values]
-        rows += [] if all(value is None for value in values) else [[info.label, *cells]]
+        if any(value is not None for value in values):
+            cells = ("–" if value is None else info.describe(value) for value in values)
+            rows.append([info.label, *cells])
     return Table(("", *columns), rows, numeric=range(1, len(columns) + 1), form="narrow")
 
 

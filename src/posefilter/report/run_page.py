@@ -67,9 +67,9 @@ def make_run_page(run: Run, changed: Sequence[Change] | None, command: str) -> P
         Section("Settings", list_settings(run, changed)),
         Section("Time and machine", [list_machine(run)]),
     ]
-    name, lines, foot = run.named("model"), head_lines(run), make_foot(run, command)
+    name, foot = run.named("model"), make_foot(run, command)
     title = f"{run.folder.resolve().name}: {name}"
-    return Page(title, name, lines, make_tiles(run), run.missing, sections, foot)
+    return Page(title, name, head_lines(run), make_tiles(run), run.missing, sections, foot)
 
 
 def head_lines(run: Run) -> list[Paragraph]:

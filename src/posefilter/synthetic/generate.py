@@ -157,6 +157,8 @@ def generate(
         instances=int(instances),
         lookalike_texture=str(lookalike_texture),
     )
+    if frames_per_scene is None:  # what suits still or moving scenes
+        frames_per_scene = 2 if moving == "none" else 30
     width, height = (int(n) for n in size)
     K = camera_matrix(camera, width, height)
     rows = tuple(tuple(float(x) for x in row) for row in K)
@@ -169,7 +171,7 @@ def generate(
         rows,
         stereo,
         sensor,
-        (2 if moving == "none" else 30) if frames_per_scene is None else int(frames_per_scene),
+        int(frames_per_scene),
         renderer,
         scenes,
         1.0 if mesh_scale is None else float(mesh_scale),

@@ -131,7 +131,8 @@ class YCBVideoReader(BaseReader):
         expect_size(depth_path, depth, height, width, color_path.name)
         expect_size(label_path, label, height, width, color_path.name)
         files = (meta_path, meta_path, depth_path, label_path)
-        mask, native = self._mask(entry, label), self._native[entry.record.object]
+        mask = self._mask(entry, label)
+        native = self._native[entry.record.object]
         return self._make_sample(i, rgb, depth, mask, entry.K, native, files)
 
     def others(self, i: int) -> np.ndarray:
