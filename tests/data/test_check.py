@@ -19,6 +19,8 @@ from dataset_trees import (
 )
 
 from posefilter.checking.check import check_dataset, format_report
+from posefilter.checking.compare import View, list_causes
+from posefilter.data.frames import Sample
 from posefilter.data.readers.bop import BopReader
 from posefilter.data.readers.fat import FatReader
 from posefilter.data.readers.ycb_video import YCBVideoReader
@@ -122,6 +124,24 @@ def test_the_cause_is_named(tmp_path, meshes, case):
     report = check(tree(tmp_path, **{"native": NATIVE, **change}), meshes)
     assert len(report["problems"]) == 1, report
     assert re.search(words, report["problems"][0]), report["problems"]
+
+
+def test_no_width_is_said_to_be_wrong_for_itself(meshes):
+    """Views of several widths share a list of causes, in the words of the first view."""
+    sample = Sample(
+        np.zeros((120, 160, 3), np.uint8),
+        np.ones((120, 160), np.float32),
+        np.ones((120, 160), bool),
+        K.astype(np.float32),
+        POSES[0].astype(np.float32),
+        0,
+        0,
+        1.0,
+    )
+    view = View(sample, np.zeros((120, 160), bool), meshes.load(NAME), NATIVE)
+    words = [one[0] for one in list_causes(view)]
+    assert "intrinsics belong to pictures 160 px wide" in words
+    assert "intrinsics belong to pictures 640 px wide, not 160" in words
 
 
 def test_two_causes_at_once(tmp_path, meshes):

@@ -141,7 +141,9 @@ def list_causes(view: View) -> list[tuple[str, np.ndarray, np.ndarray]]:
     for other in _WIDTHS:
         scale = width / other
         resized = resize_intrinsics(torch.from_numpy(K.astype(np.float64)), scale, scale).numpy()
-        words = f"intrinsics belong to pictures {other} px wide, not {width}"
+        # of several widths, the first view's may be the right one
+        wrong = f", not {width}" if other != width else ""
+        words = f"intrinsics belong to pictures {other} px wide{wrong}"
         out.append((words, pose, resized))
     return out
 
