@@ -110,12 +110,20 @@ class ProposesPoses(Protocol):
 
 
 @runtime_checkable
-class HasSurfacePoints(Protocol):
+class HasObject(Protocol):
+    """A method that was given its object."""
+
+    @property
+    def object_model(self) -> ObjectModel:
+        """The object."""
+        ...
+
+
+@runtime_checkable
+class HasSurfacePoints(HasObject, Protocol):
     """A method whose particles each have a measured point; required by
     `filter/estimate=agreement`.
     """
-
-    object_model: ObjectModel
 
     def surface_points(self, encoding: Encoding, state: Tensor) -> tuple[Tensor, Tensor]:
         """Return each particle's camera point (B, N, 3) [m], and whether its depth was measured (B,

@@ -7,12 +7,13 @@ from torch import Generator, Tensor
 
 from posefilter.capabilities import Capabilities
 from posefilter.errors import UserError
+from posefilter.filters.refine import object_of
 from posefilter.geometry.camera import back_project, project
 from posefilter.geometry.lookup import gather_pixels, nearest_pixel
 from posefilter.geometry.pose import origin_of, rotation_of, transform
 from posefilter.geometry.spaces import PoseSpace
 from posefilter.protocols import Encoding, HasDepth, Method
-from posefilter.types import BeliefBatch, ObjectModel
+from posefilter.types import BeliefBatch
 
 _FEW = 10.0  # surface points, by their weights: fewer say nothing
 _GRAZING = 0.3  # cosine of the angle between a measured surface and the way to the camera
@@ -82,7 +83,7 @@ class PointToPlaneIcp:
         self, belief: BeliefBatch, encoding: Encoding, method: Method, generator: Generator
     ) -> BeliefBatch:
         """Return the belief with the estimate moved; the score stays."""
-        object_model: ObjectModel = method.object_model  # type: ignore[attr-defined]
+        object_model = object_of(method)
         first = belief.best
         space = PoseSpace(tuple(object_model.center.tolist()), object_model.radius)
         center = object_model.center.to(first)

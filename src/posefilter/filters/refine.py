@@ -9,8 +9,8 @@ from torch import Generator, Tensor
 
 from posefilter.capabilities import Capabilities
 from posefilter.errors import UserError
-from posefilter.protocols import Encoding, Method, Refine, ScoresPoses
-from posefilter.types import BeliefBatch
+from posefilter.protocols import Encoding, HasObject, Method, Refine, ScoresPoses
+from posefilter.types import BeliefBatch, ObjectModel
 
 _RESCORED = (
     "log-likelihood of the refined estimate, up to a constant of the image and of its image "
@@ -53,6 +53,12 @@ def scorer_of(method: Method) -> ScoresPoses:
     """Return the method as one that scores poses, as `requires` of what calls this says it does."""
     assert isinstance(method, ScoresPoses)
     return method
+
+
+def object_of(method: Method) -> ObjectModel:
+    """Return the method's object, which `set_object` gives to whatever estimates poses."""
+    assert isinstance(method, HasObject)
+    return method.object_model
 
 
 def top_poses(belief: BeliefBatch, count: int) -> Tensor:

@@ -12,6 +12,7 @@ from torch import Generator, Tensor
 
 from posefilter.capabilities import Capabilities
 from posefilter.errors import UserError
+from posefilter.filters.refine import object_of
 from posefilter.filters.resample import inverse_cdf
 from posefilter.geometry.camera import project
 from posefilter.geometry.lookup import gather_pixels, nearest_pixel, sample
@@ -230,7 +231,7 @@ class TextureRotations:
         Raises:
             UserError: The object has no texture.
         """
-        object_model: ObjectModel = method.object_model  # type: ignore[attr-defined]
+        object_model = object_of(method)
         first = belief.best
         turns, first_tried = list_rotations(object_model)
         if len(turns) == 1:
@@ -256,7 +257,7 @@ class TextureRotations:
         Raises:
             UserError: As when called.
         """
-        object_model: ObjectModel = method.object_model  # type: ignore[attr-defined]
+        object_model = object_of(method)
         turns, first_tried = list_rotations(object_model)
         if len(first_tried) <= _MOST:
             return None
