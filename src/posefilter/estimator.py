@@ -185,9 +185,12 @@ class Estimator:
                 trace = method.predict_step(batch, 0)
                 found = method.assess(trace, batch)
                 apparent = method.measure_apparent_size(trace, batch)
+                belief = method.calibrate_belief(trace.belief, found)
+            calibrated = belief is not trace.belief
+            trace = trace._replace(belief=belief)
             trace.belief.best.cpu()  # waits for a GPU
             seconds = (time.perf_counter() - start) / len(images.depth)
-            runs.append(Run(method, batch, trace, seconds, found, apparent, blank))
+            runs.append(Run(method, batch, trace, seconds, found, apparent, blank, calibrated))
         return runs
 
 

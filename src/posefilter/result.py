@@ -43,7 +43,9 @@ class Result:
         presence: That the object is there, whatever the pose: at least `probability`, or None.
         pose_tolerance: What a right pose is, which the verdict goes by; None: what `probability` is
             of.  See `probability_within`.
-        belief: Every particle and its weight.
+        belief: Weighted poses.  Where `belief_calibrated` they are about the estimate, as wide as
+            the error of a right estimate is, which holds with `probability`; else every particle
+            and its weight, as the filter leaves them.
         warnings: What makes the estimate implausible, in words; empty where nothing does.
         apparent_size: How large the object appears, relative to its mesh: 1 where the depth and the
             intrinsics are right.  NaN where the method cannot tell, or too few pixels show it.
@@ -61,6 +63,8 @@ class Result:
         depth_inlier_fraction: The fraction of the object's surface points, those that face away
             included, whose depth at the pose agrees with the measured one.  Earlier calibrations
             choose the group of a conformal set by it, under the name `surface`.
+        belief_calibrated: Whether the belief's width is calibrated, as of one image it is; not of
+            instances and of tracks, and by an earlier version's calibration.
         instance: Which of its class it is, from 0, the most probable first.
         mask: The pixels (H, W) bool of the image that are its own, where instances were asked for;
             else None.
@@ -85,6 +89,7 @@ class Result:
     apparent_size: float = field(default=math.nan, kw_only=True)
     wrong_size: bool = field(default=False, kw_only=True)
     blank: str = field(default="", kw_only=True)
+    belief_calibrated: bool = field(default=False, kw_only=True)
     instance: int = field(default=0, kw_only=True)
     mask: np.ndarray | None = field(default=None, kw_only=True)
 
@@ -301,6 +306,7 @@ class Run(NamedTuple):
     found: Assessment | None = None  # None where there is no probability
     size: ApparentSize | None = None  # None where the method cannot tell
     blank: Sequence[str] = ()  # of each image, as `find_blank` says it; none: all can be judged
+    calibrated: bool = False  # whether the trace's belief is, see `PoseEstimator.calibrate_belief`
 
 
 def collect_results(
@@ -366,6 +372,7 @@ def make_result(
         apparent_size=size,
         wrong_size=wrong_size,
         blank=blank,
+        belief_calibrated=run.calibrated,
     )
 
 

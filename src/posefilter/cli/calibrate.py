@@ -5,10 +5,11 @@ frames with the object and without.
 import math
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from posefilter.cli.build import build_data
 from posefilter.cli.checkpoints import find_checkpoint, method_of, read_checkpoint
@@ -18,6 +19,13 @@ from posefilter.cli.evaluate import data_settings
 from posefilter.cli.files import save_whole
 from posefilter.cli.job import Job
 from posefilter.cli.machine import settle
+from posefilter.confidence.belief_scale import (
+    BeliefScale,
+    PoseSpread,
+    calibrate_belief,
+    fit_belief_scale,
+    measure_spread,
+)
 from posefilter.confidence.calibration import Assessment, Calibration
 from posefilter.confidence.fit import (
     FEWEST,
@@ -39,7 +47,7 @@ from posefilter.metrics.credibility import score_truth
 from posefilter.metrics.registry import find_metric
 from posefilter.models.base import PoseEstimator
 from posefilter.progress import watched
-from posefilter.types import Batch
+from posefilter.types import Batch, BeliefBatch, ObjectModel
 
 _BATCH = 8  # images
 _SHOWN = ("auroc", "auroc_presence", "ece", "brier", "found", "false_alarms")
@@ -100,14 +108,25 @@ def check_out(checkpoint: dict[str, Any], file: Path, out: Path, replace: bool) 
         raise UserError(f"{file}: is calibrated already; overwrite=true calibrates it anew")
 
 
+class Beliefs(NamedTuple):
+    """The beliefs of n frames that show the object, as the filter leaves them, and the truths."""
+
+    beliefs: BeliefBatch
+    truth: Tensor  # (n, 4, 4)
+
+    def select(self, index: np.ndarray) -> "Beliefs":
+        """Return some of the frames."""
+        return Beliefs(BeliefBatch(*(part[index] for part in self.beliefs)), self.truth[index])
+
+
 def collect_frames(
     method: PoseEstimator,
     present: Sequence[FrameDataset],
     absent: Sequence[FrameDataset],
     shown: bool = False,
-) -> Frames:
+) -> tuple[Frames, Beliefs]:
     """Run a filter on frames with the object and without, and return what speaks for each
-    estimate, and how far it is off.
+    estimate, how far it is off, and the beliefs of frames with the object.
 
     Args:
         method: A method with its weights.
@@ -115,7 +134,7 @@ def collect_frames(
         absent: Frames without.
         shown: Draw a bar.
     """
-    values, there, errors, scores = [], [], [], []
+    values, there, errors, beliefs = [], [], [], []
     parts = [(one, True) for one in present] + [(one, False) for one in absent]
     batches = [
         (batch, is_there) for one, is_there in parts for batch in make_loader(one, _BATCH, 0)
@@ -127,15 +146,14 @@ def collect_frames(
             trace = method.predict_step(seen, number)
             values.append(method.collect_features(trace, seen))
         there.append(np.full(len(truth), is_there))
-        nothing = np.full(len(truth), np.nan)
-        off, surprise = PoseErrors(*[nothing] * 4), nothing
+        off = PoseErrors(*[np.full(len(truth), np.nan)] * 4)
         if is_there:
             measured = measure_pose_errors(trace.belief.best.cpu(), truth, method.object_model)
             off = PoseErrors(*(part.double().numpy() for part in measured))
-            surprise = score_truth(trace.belief, truth, method.object_model).nonconformity.numpy()
+            beliefs.append((*(part.cpu() for part in trace.belief), truth))
         errors.append(off)
-        scores.append(surprise)
-    return make_frames(values, there, errors, scores)
+    *own, truths = (torch.cat(parts) for parts in zip(*beliefs, strict=True))
+    return make_frames(values, there, errors), Beliefs(BeliefBatch(*own), truths)
 
 
 def learn(
@@ -148,7 +166,7 @@ def learn(
     """Return the calibration of a method, with its quality on held-out parts of the frames.
 
     Frames are searched twice: first answers teach what answers are compared by; the answers that
-    are then chosen teach the probabilities.
+    are then chosen teach the probabilities, and how wide a belief is.
 
     Args:
         method: A method with its weights; its calibration is replaced.
@@ -158,13 +176,64 @@ def learn(
         shown: Draw bars.
     """
     method.calibration, first = None, None
-    frames = collect_frames(method, present, absent, shown)
+    frames, beliefs = collect_frames(method, present, absent, shown)
     if method.filter.max_searches > 1:
         method.calibration = first = fit_choice(frames, source)
-        frames = collect_frames(method, present, absent, shown)
-    held = measure_quality(frames, cross_validate(frames, first=first))
-    quality = {key: float(held[key]) for key in _SHOWN if math.isfinite(held[key])}
-    return fit_calibration(frames, source, quality, first)
+        frames, beliefs = collect_frames(method, present, absent, shown)
+    held = cross_validate(frames, first=first)
+    scores = measure_quality(frames, held)
+    quality = {key: float(scores[key]) for key in _SHOWN if math.isfinite(scores[key])}
+    own = frames.present
+    scale, surprise = fit_beliefs(
+        beliefs, held.probability[own], frames.correct[own], method.object_model
+    )
+    nonconformity = np.full(len(own), np.nan)
+    nonconformity[own] = surprise
+    frames = frames._replace(nonconformity=nonconformity)
+    return fit_calibration(frames, source, quality, first, scale)
+
+
+def fit_beliefs(
+    beliefs: Beliefs,
+    probability: Tensor,
+    right: np.ndarray,
+    object_model: ObjectModel,
+    folds: int = 5,
+    seed: int = 0,
+) -> tuple[BeliefScale | None, np.ndarray]:
+    """Return the scale of beliefs, and the nonconformity of the truths under calibrated beliefs.
+
+    Args:
+        beliefs: Of n frames.
+        probability: (n,) of each, by a calibration that has not seen it.
+        right: (n,) bool, whether the estimate is right.
+        object_model: The object.
+        folds: Each frame's belief is calibrated by a fit to the other parts.
+        seed: Of their shuffle.
+
+    Returns:
+        The scale of all frames, None where too few are right; and (n,) [nat], of the beliefs as
+        they are where a fit has too few.
+    """
+    spread = measure_spread(*beliefs, object_model)
+
+    def fit(index: np.ndarray) -> BeliefScale | None:
+        index = index[right[index]]
+        return fit_belief_scale(PoseSpread(*(x[index] for x in spread)), probability[index])
+
+    fold = np.random.default_rng(seed).permutation(len(right)) % folds
+    nonconformity = np.full(len(right), np.nan)
+    whole = fit(np.arange(len(right)))
+    for k in range(folds):
+        held = np.flatnonzero(fold == k)
+        if not len(held):
+            continue
+        own, truth = beliefs.select(held)
+        scale = None if whole is None else fit(np.flatnonzero(fold != k)) or whole
+        if scale is not None:
+            own = calibrate_belief(own, probability[held], scale, object_model)
+        nonconformity[held] = score_truth(own, truth, object_model).nonconformity.numpy()
+    return whole, nonconformity
 
 
 def measure_quality(frames: Frames, found: Assessment) -> dict[str, Any]:

@@ -21,6 +21,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from posefilter.confidence.belief_scale import BeliefScale
 from posefilter.confidence.conformal import GROUPED_BY, Conformal
 from posefilter.confidence.logistic import Logistic, fit_logistic
 from posefilter.confidence.tolerance import RIGHT, PoseErrors, PoseTolerance
@@ -30,6 +31,7 @@ LIMIT = 3.0  # standard deviations
 COUNTS = ("right", "wrong", "absent")
 _MOST_FEATURES, _LARGEST, _MOST_FRAMES = 16, 1e6, 10_000_000
 _MOST_GROUPS, _MOST_SCORES = 16, 100_000
+_MOST_LOG = 10.0  # of a belief's scale
 _FARTHEST = 60_000.0  # error that float16 holds
 _RENAMED = {  # features, by their names in earlier versions
     "solid": "free_space",
@@ -37,7 +39,7 @@ _RENAMED = {  # features, by their names in earlier versions
     "recognized": "mask_recall",
     "glimpsed": "top_objectness",
 }
-_LATER = {"conformal", "choice", "errors"}  # keys that earlier versions do not have
+_LATER = {"conformal", "choice", "errors", "belief_scale"}  # keys that earlier versions do not have
 _NAME = re.compile(r"[a-z][a-z0-9_]{0,39}")
 
 
@@ -87,6 +89,9 @@ class Calibration:
             version, whose filter gives one answer.
         errors: What the success at other tolerances is learned from. None: of an earlier version,
             which knows of an ADD below 0.1 diameters alone.
+        belief_scale: What makes a belief as wide as the errors of right estimates. None: too few of
+            the frames had a right estimate, or of an earlier version; beliefs are then the
+            particles as the filter leaves them.
     """
 
     features: tuple[str, ...]
@@ -100,6 +105,7 @@ class Calibration:
     conformal: Conformal | None = None
     choice: Logistic | None = None
     errors: CalibrationErrors | None = None
+    belief_scale: BeliefScale | None = None
 
     def assess(self, values: Mapping[str, Tensor], tolerance: PoseTolerance = RIGHT) -> Assessment:
         """Return the probabilities of estimates.
@@ -267,6 +273,7 @@ def _read(content: Any) -> Calibration:
         _conformal(content.get("conformal")),
         None if content.get("choice") is None else _logistic(content["choice"], count, "choice"),
         _errors(content.get("errors"), count),
+        _belief_scale(content.get("belief_scale")),
     )
 
 
@@ -275,6 +282,17 @@ def _logistic(content: Any, count: int, name: str) -> Logistic:
         raise ValueError(f"should have weights and bias in {name}")
     weights = _numbers(content["weights"], count, f"{name}'s weights", minimum=0.0)
     return Logistic(weights, _numbers([content["bias"]], 1, f"{name}'s bias")[0])
+
+
+def _belief_scale(content: Any) -> BeliefScale | None:
+    if content is None:
+        return None
+    if not isinstance(content, dict) or set(content) != {"bias", "slope"}:
+        raise ValueError("should have bias and slope in belief_scale")
+    both = _numbers([content["bias"], content["slope"]], 2, "belief_scale", minimum=-_MOST_LOG)
+    if max(both) > _MOST_LOG:
+        raise ValueError("has numbers out of range in belief_scale")
+    return BeliefScale(*both)
 
 
 def _errors(content: Any, count: int) -> CalibrationErrors | None:

@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
+from posefilter.confidence.belief_scale import BeliefScale
 from posefilter.confidence.calibration import (
     Assessment,
     Calibration,
@@ -28,7 +29,8 @@ class Frames(NamedTuple):
     values: np.ndarray  # (n, F)
     present: np.ndarray  # (n,) bool: the object is in the image
     correct: np.ndarray  # (n,) bool: and the estimate within 0.1 diameters
-    # (n,) of the true pose, NaN where the object is not in the image [nat]; None: not measured
+    # (n,) of the true pose under the calibrated belief, NaN where the object is not in the image
+    # [nat]; None: not measured
     nonconformity: np.ndarray | None = None
     # of (n,) each, NaN where the object is not in the image; None: not measured
     errors: PoseErrors | None = None
@@ -45,16 +47,15 @@ def make_frames(
     values: Sequence[Mapping[str, torch.Tensor]],
     present: Sequence[np.ndarray],
     errors: Sequence[PoseErrors],
-    nonconformity: Sequence[np.ndarray],
 ) -> Frames:
     """Return the frames of batches of features, each (B,) by name; errors are NaN where the object
     is not in the image.
     """
     names = tuple(values[0])
     rows = [np.stack([one[name].double().cpu().numpy() for name in names], 1) for one in values]
-    all_rows, seen, scores = (np.concatenate(one) for one in (rows, present, nonconformity))
+    all_rows, seen = (np.concatenate(one) for one in (rows, present))
     off = PoseErrors(*(np.concatenate(parts) for parts in zip(*errors, strict=True)))
-    return Frames(names, all_rows, seen, RIGHT.accepts(off), scores, off)
+    return Frames(names, all_rows, seen, RIGHT.accepts(off), None, off)
 
 
 def fit_choice(frames: Frames, source: str) -> Calibration:
@@ -84,6 +85,7 @@ def fit_calibration(
     source: str,
     quality: Mapping[str, float] | None = None,
     first: Calibration | None = None,
+    belief_scale: BeliefScale | None = None,
 ) -> Calibration:
     """Fit both regressions.
 
@@ -96,12 +98,13 @@ def fit_calibration(
         quality: Of held-out predictions.
         first: What the answers were chosen by, see `fit_choice`; features are standardized as it
             does. None: they are first answers, and no others are searched for.
+        belief_scale: What the beliefs were calibrated by that `nonconformity` is of.
 
     Raises:
         UserError: There are too few frames with the object, or without.
     """
     _check_counts(frames)
-    fitted = _fit(frames, source, quality or {}, first)
+    fitted = replace(_fit(frames, source, quality or {}, first), belief_scale=belief_scale)
     if frames.nonconformity is None:
         return fitted
     own = frames.present

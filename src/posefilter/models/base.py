@@ -18,6 +18,7 @@ from torch.optim.lr_scheduler import LRScheduler
 
 from posefilter.capabilities import Capabilities, check_parts, collect_provided
 from posefilter.confidence.apparent_size import ApparentSize
+from posefilter.confidence.belief_scale import calibrate_belief
 from posefilter.confidence.blank import find_blank
 from posefilter.confidence.calibration import Assessment, Calibration
 from posefilter.confidence.features import measure_belief, measure_depth, measure_print
@@ -37,7 +38,15 @@ from posefilter.models.clipping import clip_submodules
 from posefilter.models.lr_schedulers import find_length
 from posefilter.models.zoom import choose_part, search
 from posefilter.protocols import Loss, Space
-from posefilter.types import Batch, ObjectModel, ParticleOutput, Particles, Step, Trace
+from posefilter.types import (
+    Batch,
+    BeliefBatch,
+    ObjectModel,
+    ParticleOutput,
+    Particles,
+    Step,
+    Trace,
+)
 
 if TYPE_CHECKING:
     from lightning import LightningModule as Module
@@ -273,6 +282,22 @@ class PoseEstimator(Module):
         features = self.collect_features(trace, batch)
         return self.calibration.assess(features, self.pose_tolerance)
 
+    def calibrate_belief(self, belief: BeliefBatch, found: Assessment | None) -> BeliefBatch:
+        """Return beliefs as wide as the errors of right estimates are (confidence/belief_scale.py).
+
+        Args:
+            belief: B beliefs, as the filter leaves them.
+            found: What `assess` says of them; where it is None, or the calibration knows no scale,
+                beliefs are returned as they are.
+        """
+        if found is None or self.calibration is None or self.calibration.belief_scale is None:
+            return belief
+        assert found.features is not None
+        right = self.calibration.assess(found.features).probability  # within the default tolerance
+        return calibrate_belief(
+            belief, right, self.calibration.belief_scale, self.object_model
+        )
+
     # -- training ---------------------------------------------------------------------------------
 
     def training_losses(self, batch: Batch, generator: Generator) -> dict[str, Tensor]:
@@ -418,10 +443,11 @@ class PoseEstimator(Module):
             self.scores["poses"].update(best, true_pose)
             self.scores["bop"].update(best, true_pose, batch.intrinsics, width)
             self.scores["by_visibility"].collect(best, true_pose, batch.visibility)
-            self.scores["belief"].update(trace.belief, true_pose)
-            seen = score_truth(trace.belief, true_pose, self.object_model)
+            found = self.judge_confidence(trace, batch, present=True)
+            belief = self.calibrate_belief(trace.belief, found)
+            self.scores["belief"].update(belief, true_pose)
+            seen = score_truth(belief, true_pose, self.object_model)
             self.scores["credibility"].update(seen, batch.visibility)
-            self.judge_confidence(trace, batch, present=True)
         if "parts" in self.scores:
             self.scores["parts"].update(best, batch)
 
@@ -434,9 +460,9 @@ class PoseEstimator(Module):
         presence, probability = self.scores["confidence"].rows[-1][:, :2].T
         return Assessment(presence, probability)
 
-    def judge_confidence(self, trace: Trace, batch: Batch, present: bool) -> None:
+    def judge_confidence(self, trace: Trace, batch: Batch, present: bool) -> Assessment | None:
         """Add a batch's probabilities, where the method is calibrated, and apparent sizes, where it
-        can tell them, to the metrics.
+        can tell them, to the metrics; return the probabilities.
 
         Args:
             trace: A finished run of the filter.
@@ -450,7 +476,7 @@ class PoseEstimator(Module):
             self.scores["apparent_size"].update(*known)
         found = self.assess(trace, batch)
         if found is None:
-            return
+            return None
         right = torch.zeros(len(batch.rgb), dtype=torch.bool)
         if present:
             truth = batch.camera_from_object
@@ -468,6 +494,7 @@ class PoseEstimator(Module):
         self.scores["confidence"].update(
             found.presence, found.probability, torch.full_like(right, present), right, verdict
         )
+        return found
 
     def box(self, trace: Trace, batch: Batch) -> Tensor:
         """Return the bounding box of the object's hull at the estimated pose, (B, 4) [px].
