@@ -14,12 +14,15 @@ that of it.
 
 Every frame below --root is taken, in a fixed shuffle: --frames with a visibility above 0.1, and
 --without that lack the object.  A row an image is added to the file; started again, it goes on, and
---minutes ends it early.
+--minutes ends it early.  What the filter leaves is kept in FILE.beliefs: without the rows, they are
+judged anew in a fraction of the time, by other calibrations of the same filter.
 
 Shown is the share of the object that is seen: the visible share of what lies in the frame, times
 the share of its surface points that the frame holds, since the frame cuts many off.  Coverage is
 that of conformal and of credible sets.  In the band: the share of the true outline's points, of the
-hull, that lie in the 95 % band of the belief (`Result.draw_band`).
+hull, that lie in the 95 % band of the belief (`Result.draw_band`).  The last table is of frames
+whose estimate is right: ellipsoids are of the belief's covariance about the estimate, in the shape
+of Student's t with 5 degrees of freedom.
 """
 
 import argparse
@@ -28,15 +31,18 @@ import math
 import sys
 import time
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
 import torch
 from checkpoint_frames import open_frames
 from confidence import read_tolerance
+from scipy.stats import f as f_distribution
 
+from posefilter.belief import Belief
 from posefilter.cli.checkpoints import method_of, read_checkpoint
 from posefilter.confidence.fit import Frames, fit_calibration
 from posefilter.confidence.tolerance import RIGHT, PoseErrors, PoseTolerance, measure_pose_errors
@@ -46,36 +52,90 @@ from posefilter.figures.band import find_band, measure_cover
 from posefilter.figures.canvas import View
 from posefilter.geometry.camera import project
 from posefilter.geometry.pose import transform
+from posefilter.geometry.pose_statistics import twist_between
 from posefilter.metrics.confidence import calibration_error, error_at_coverage
 from posefilter.metrics.credibility import SHOWN, score_truth
 from posefilter.metrics.diagnostics import auroc
 from posefilter.models.base import PoseEstimator
-from posefilter.types import Batch
+from posefilter.types import Batch, BeliefBatch, ObjectModel
 
 QUARTERS = (0.0, 0.25, 0.5, 0.75)
 LEVEL = 0.95  # of the band
+LEVELS = " / ".join(map(str, SHOWN))
 SURE, LOST = 0.8, 0.2  # found from this probability, absent below this presence
 Row = dict[str, Any]
 
 
-def measure_shown(batch: Batch, points: torch.Tensor) -> torch.Tensor:
+class Observation(NamedTuple):
+    """What a filter makes of a batch of images, before any calibration of its belief."""
+
+    belief: BeliefBatch
+    features: dict[str, torch.Tensor]  # (B,) each
+    truth: torch.Tensor  # (B, 4, 4); of images without the object not used
+    intrinsics: torch.Tensor  # (B, 3, 3)
+    visibility: torch.Tensor  # (B,)
+    size: tuple[int, int]  # of the images: height, width
+    scenes: tuple[str, ...]  # B
+
+
+def observe(method: PoseEstimator, batch: Batch, number: int, scenes: Sequence[str]) -> Observation:
+    """Run the filter on a batch; `scenes` are those of its images."""
+    seen = Batch(*hide_annotation(batch))
+    with torch.no_grad():
+        trace = method.predict_step(seen, number)
+        features = method.collect_features(trace, seen)
+    size = (batch.depth.shape[-2], batch.depth.shape[-1])
+    about = (batch.camera_from_object, batch.intrinsics, batch.visibility, size, tuple(scenes))
+    return Observation(trace.belief, dict(features), *about)
+
+
+def save_observation(found: Observation, file: Path) -> None:
+    """Write an observation as .npz, whole or not at all."""
+    arrays = {key: part.numpy() for key, part in found.belief._asdict().items()}
+    arrays |= {f"feature.{key}": part.numpy() for key, part in found.features.items()}
+    arrays |= {"truth": found.truth.numpy(), "intrinsics": found.intrinsics.numpy()}
+    arrays |= {"visibility": found.visibility.numpy(), "size": np.array(found.size)}
+    part = file.with_suffix(".part.npz")
+    np.savez(part, **arrays, scenes=np.array(found.scenes))
+    part.replace(file)
+
+
+def load_observation(file: Path) -> Observation:
+    """Read what `save_observation` writes."""
+    with np.load(file) as read:
+        arrays = dict(read)
+    tensors = {k: torch.from_numpy(v) for k, v in arrays.items() if k not in ("scenes", "size")}
+    features = {k.removeprefix("feature."): v for k, v in tensors.items() if "." in k}
+    height, width = arrays["size"].tolist()
+    return Observation(
+        BeliefBatch(*(tensors[key] for key in BeliefBatch._fields)),
+        features,
+        tensors["truth"],
+        tensors["intrinsics"],
+        tensors["visibility"],
+        (height, width),
+        tuple(arrays["scenes"].tolist()),
+    )
+
+
+def measure_shown(found: Observation, points: torch.Tensor) -> torch.Tensor:
     """Return the share of the object that is seen.  points (P, 3) [m] -> (B,)."""
-    at = transform(batch.camera_from_object, points)
-    u, v = project(at, batch.intrinsics).unbind(-1)
-    height, width = batch.depth.shape[-2:]
+    at = transform(found.truth, points)
+    u, v = project(at, found.intrinsics).unbind(-1)
+    height, width = found.size
     inside = (u > -0.5) & (u < width - 0.5) & (v > -0.5) & (v < height - 0.5) & (at[..., 2] > 0.01)
-    return batch.visibility * inside.float().mean(1)
+    return found.visibility * inside.float().mean(1)
 
 
 def measure_band(
-    poses: np.ndarray, weights: np.ndarray, truth: np.ndarray, hull: np.ndarray, batch: Batch
+    belief: Belief, truth: np.ndarray, hull: np.ndarray, K: np.ndarray, size: tuple[int, int]
 ) -> float:
     """Return the share of the true outline's points that lie in the band; NaN where there are none.
 
-    (N, 4, 4), (N,), (4, 4), (V, 3) [m]; a batch of one image.
+    truth (4, 4), hull (V, 3) [m], K (3, 3) [px], size (height, width).
     """
-    height, width = batch.depth.shape[-2:]
-    view, K = View(-0.5, -0.5, 1.0, width, height), batch.intrinsics[0].double().numpy()
+    height, width = size
+    view, poses, weights = View(-0.5, -0.5, 1.0, width, height), belief.samples, belief.weights
     surely, maybe = find_band(measure_cover(poses, weights, hull, K, view), LEVEL)
     own = measure_cover(truth[None], np.ones(1), hull, K, view) > 0.5
     mask, ring = own.astype(np.uint8), np.ones((3, 3), np.uint8)
@@ -87,43 +147,72 @@ def measure_band(
     return 1 - 2 * missed / total if total else float("nan")
 
 
-def look(
-    method: PoseEstimator, batch: Batch, number: int, there: bool, scenes: Sequence[str]
-) -> Iterator[Row]:
-    """Run the filter on a batch, and yield a row an image; `scenes` are those of its images."""
+def measure_error(
+    belief: Belief, estimate: np.ndarray, truth: np.ndarray
+) -> tuple[float, list[bool]]:
+    """Return how far the truth is from an estimate by the belief's covariance about it, as the
+    level of the smallest ellipsoid of Student's t that holds it; and whether it is within the
+    translation and the rotation of `Belief.uncertainty`.
+    """
+    near = replace(belief, samples=truth[None], weights=np.ones(1)).canonicalize(estimate)
+    about = torch.from_numpy(estimate)
+    twist = twist_between(about, torch.from_numpy(near.samples[0]), torch.from_numpy(belief.center))
+    error, spread = twist.numpy(), belief.covariance_about(estimate)
+    squared = float(error @ np.linalg.lstsq(spread, error, rcond=1e-9)[0])
+    level = float(f_distribution.cdf(squared * 5 / 3 / 6, 6, 5))
+    sure = belief.uncertainty()
+    off = (np.linalg.norm(error[:3]), np.linalg.norm(error[3:]))
+    pairs = zip(off, (sure.translation, sure.rotation), strict=True)
+    return level, [bool(one <= most) for one, most in pairs]
+
+
+def look(method: PoseEstimator, found: Observation, there: bool) -> Iterator[Row]:
+    """Yield a row an image of what the method's calibration says of it."""
     object_model, calibration = method.object_model, method.calibration
     assert calibration is not None
-    seen = Batch(*hide_annotation(batch))
-    with torch.no_grad():
-        trace = method.predict_step(seen, number)
-        values = method.collect_features(trace, seen)
-    found = calibration.assess(values)
-    truth_poses = batch.camera_from_object
-    errors = measure_pose_errors(trace.belief.best, truth_poses, object_model) if there else None
-    truths = score_truth(trace.belief, truth_poses, object_model) if there else None
-    shown = measure_shown(batch, object_model.points[:: max(1, len(object_model.points) // 500)])
-    for i in range(len(batch.rgb)):
+    said = calibration.assess(found.features)
+    belief = method.calibrate_belief(found.belief, said)
+    errors, seen = None, []
+    if there:
+        errors = measure_pose_errors(belief.best, found.truth, object_model)
+        # as it is calibrated, and as the filter leaves it
+        seen = [score_truth(one, found.truth, object_model) for one in (belief, found.belief)]
+    shown = measure_shown(found, object_model.points[:: max(1, len(object_model.points) // 500)])
+    hull = object_model.hull.double().numpy()
+    for i, scene in enumerate(found.scenes):
         off = [math.nan] * 4 if errors is None else [float(part[i]) for part in errors]
         row: Row = {"object": object_model.name, "there": there, "errors": off}
         row["right"] = bool(RIGHT.accepts(PoseErrors(*np.array(off))))
-        row |= {"presence": float(found.presence[i]), "probability": float(found.probability[i])}
-        row |= {"scene": scenes[i], "features": {k: float(v[i]) for k, v in values.items()}}
-        if truths is not None:
-            row |= {"visibility": float(batch.visibility[i]), "shown": float(shown[i])}
-            row |= {"rank": float(truths.rank[i]), "log_density": float(truths.log_density[i])}
-            sets = calibration.conformal
+        row |= {"presence": float(said.presence[i]), "probability": float(said.probability[i])}
+        row |= {"scene": scene, "features": {k: float(v[i]) for k, v in found.features.items()}}
+        if there:
+            row |= {"visibility": float(found.visibility[i]), "shown": float(shown[i])}
+            sets, (calibrated, plain) = calibration.conformal, seen
             assert sets is not None
             by_surface = sets.by == "surface"
-            value = float(values["surface"][i]) if by_surface else row["probability"]
-            nonconformity = float(truths.nonconformity[i])
+            value = float(found.features["surface"][i]) if by_surface else row["probability"]
+            nonconformity = float(calibrated.nonconformity[i])
             row["nonconformity"] = nonconformity
             row["held"] = [nonconformity <= sets.find_limit(level / 100, value) for level in SHOWN]
-            weights = trace.belief.log_weights[i].double().softmax(0).numpy()
-            one = Batch(*(part[i : i + 1] for part in batch))
-            belief, truth = trace.belief.poses[i].double().numpy(), batch.camera_from_object[i]
-            hull = object_model.hull.double().numpy()
-            row["band"] = measure_band(belief, weights, truth.double().numpy(), hull, one)
+            truth, K = (x[i].double().numpy() for x in (found.truth, found.intrinsics))
+            for which, scores, of in (("", calibrated, belief), ("plain_", plain, found.belief)):
+                own = open_belief(of, i, object_model)
+                row[f"{which}rank"] = float(scores.rank[i])
+                row[f"{which}log_density"] = float(scores.log_density[i])
+                estimate = of.best[i].double().numpy()
+                row[f"{which}level"], row[f"{which}within"] = measure_error(own, estimate, truth)
+                sure = own.uncertainty()
+                row[f"{which}says"] = [sure.translation, sure.rotation]
+                row[f"{which}band"] = measure_band(own, truth, hull, K, found.size)
         yield row
+
+
+def open_belief(beliefs: BeliefBatch, i: int, object_model: ObjectModel) -> Belief:
+    """Return one belief of a batch as users get it."""
+    weights = beliefs.log_weights[i].double().softmax(0).numpy()
+    sizes = (float(object_model.radius), float(object_model.diameter), object_model.name)
+    center, group = (x.double().numpy() for x in (object_model.center, object_model.symmetries))
+    return Belief(beliefs.poses[i].double().numpy(), weights, center, *sizes, group)
 
 
 def collect(file: str, options: Any, end: float) -> bool:
@@ -136,6 +225,8 @@ def collect(file: str, options: Any, end: float) -> bool:
     if method.calibration is None or method.calibration.conformal is None:
         raise SystemExit(f"{file}: is not calibrated, or without conformal sets")
     rows = read_rows(options.rows) if options.rows.exists() else []
+    store = options.rows.with_suffix(".beliefs")
+    store.mkdir(parents=True, exist_ok=True)
     data = open_frames(file, checkpoint, name, options)
     parts = ((data.val_dataset, True), (data.absent_dataset("val", options.without), False))
     for dataset, there in parts:
@@ -145,10 +236,15 @@ def collect(file: str, options: Any, end: float) -> bool:
                 continue
             if time.monotonic() > end:
                 return False
-            first = 8 * number
-            scenes = [one.group for one in dataset.records[first : first + 8]]
+            stored = store / f"{name}.{'with' if there else 'without'}.{number:04d}.npz"
+            if stored.exists():
+                found = load_observation(stored)
+            else:
+                records = dataset.records[8 * number : 8 * number + 8]
+                found = observe(method, batch, number, [one.group for one in records])
+                save_observation(found, stored)
             with options.rows.open("a") as out:
-                lines = [json.dumps(row) for row in look(method, batch, number, there, scenes)]
+                lines = [json.dumps(row) for row in look(method, found, there)]
                 out.write("\n".join(lines) + "\n")
     return True
 
@@ -224,31 +320,61 @@ def draw_table(head: Sequence[str], rows: Sequence[Sequence[Any]]) -> str:
     return "\n".join(f"| {' | '.join(map(str, line))} |" for line in lines)
 
 
+def share(hits: Sequence[Any]) -> str:
+    """Return the percentages of columns of hits, such as `48 / 81`."""
+    return " / ".join(f"{100 * x:.0f}" for x in np.atleast_1d(np.mean(hits, axis=0)))
+
+
 def cover(rows: Sequence[Row]) -> list[str]:
     """Return frames, coverage of conformal and of credible sets, and the share in the band."""
-    held = 100 * np.mean([row["held"] for row in rows], axis=0)
-    rank = np.array([row["rank"] for row in rows])
-    plain = [100 * float((rank < level / 100).mean()) for level in SHOWN]
     band = 100 * float(np.nanmean([row["band"] for row in rows]))
-    sets = [" / ".join(f"{x:.0f}" for x in shares) for shares in (held, plain)]
-    return [str(len(rows)), *sets, f"{band:.0f}"]
+    ranks = [[row["rank"] < level / 100 for level in SHOWN] for row in rows]
+    return [str(len(rows)), share([row["held"] for row in rows]), share(ranks), f"{band:.0f}"]
 
 
 def tabulate_coverage(rows: Sequence[Row]) -> str:
     """Return coverage by object, by visibility and by what is shown."""
+    head = ("frames of", "frames", f"conformal sets of {LEVELS} %", "credible sets", "in the band")
     own = [row for row in rows if row["there"]]
-    names = dict.fromkeys(row["object"] for row in own)
-    lines = [[name, *cover([row for row in own if row["object"] == name])] for name in names]
-    lines.append(["all", *cover(own)])
+    return draw_table(head, [[name, *cover(some)] for name, some in divide(own)])
+
+
+def divide(rows: Sequence[Row]) -> Iterator[tuple[str, list[Row]]]:
+    """Yield groups of rows with their names: objects, all, visibility, what is shown."""
+    for name in dict.fromkeys(row["object"] for row in rows):
+        yield name, [row for row in rows if row["object"] == name]
+    yield "all", list(rows)
     for key in ("visibility", "shown"):
         for low in QUARTERS:
             high = low + 0.25 if low < 0.75 else 2
-            some = [row for row in own if low <= row[key] < high]
+            some = [row for row in rows if low <= row[key] < high]
             if some:
-                lines.append([f"{key} {low:g} to {min(high, 1):g}", *cover(some)])
-    levels = " / ".join(f"{level}" for level in SHOWN)
-    head = ("frames of", "frames", f"conformal sets of {levels} %", "credible sets", "in the band")
-    return draw_table(head, lines)
+                yield f"{key} {low:g} to {min(high, 1):g}", some
+
+
+def tabulate_beliefs(rows: Sequence[Row]) -> str:
+    """Return what beliefs say of frames whose estimate is right, as they are calibrated and as the
+    filter leaves them.
+    """
+    own = [row for row in rows if row["right"]]
+    lines = []
+    for name, some in divide(own):
+        for which, said in (("", "calibrated"), ("plain_", "as the filter leaves it")):
+            levels = [[row[f"{which}level"] < level / 100 for level in SHOWN] for row in some]
+            ranks = [[row[f"{which}rank"] < level / 100 for level in SHOWN] for row in some]
+            translation, rotation = np.median([row[f"{which}says"] for row in some], axis=0)
+            lines.append(
+                [
+                    *(name, said, str(len(some)), share(levels), share(ranks)),
+                    share([row[f"{which}within"] for row in some]),
+                    f"{1000 * translation:.1f} mm, {math.degrees(rotation):.1f}",
+                    f"{100 * float(np.nanmean([row[f'{which}band'] for row in some])):.0f}",
+                    f"{np.mean([row[f'{which}log_density'] for row in some]):.1f}",
+                ]
+            )
+    head = ["right frames of", "belief", "frames", f"ellipsoids of {LEVELS} %", "credible sets"]
+    head += ["within what it says at 95 %: shift / turn", "which is in the median", "in the band"]
+    return draw_table([*head, "log density"], lines)
 
 
 def tell_presence(rows: Sequence[Row], min_shown: float) -> str:
@@ -321,7 +447,10 @@ def main() -> int:
     rows = read_rows(options.table or options.cross or options.rows)
     if options.cross is not None:
         rows = judge_across(rows, options.most, options.leave_out, tolerance)
-    print(tabulate_coverage(rows), tabulate_confidence(rows), sep="\n\n")
+    tables = [tabulate_coverage(rows), tabulate_confidence(rows)]
+    if all("level" in row for row in rows if row["there"]):  # not in rows of earlier versions
+        tables.append(tabulate_beliefs(rows))
+    print(*tables, sep="\n\n")
     return 0 if whole else 3
 
 

@@ -36,6 +36,7 @@ _BIAS, _SLOPE = (-0.2, 0.5), (-0.2, 0.1)
 # much as so many particles: C has full rank also where few are near the estimate
 _PRIOR_ERROR, _PRIOR_COUNT = 0.03, 4.0
 _FEWEST_PARTICLES, _FEWEST_DRAWS = 200, 32
+_SEED = 197  # of 300, that whose draws' lengths are nearest to the distribution's
 
 
 @dataclass(frozen=True)
@@ -66,9 +67,7 @@ class PoseSpread(NamedTuple):
     scatter: Tensor  # (n, 6, 6) second moment of the particles about the estimate
 
 
-def measure_spread(
-    belief: BeliefBatch, truth: Tensor, object_model: ObjectModel
-) -> PoseSpread:
+def measure_spread(belief: BeliefBatch, truth: Tensor, object_model: ObjectModel) -> PoseSpread:
     """Return the errors of estimates, and the scatter of their particles, float64 on the CPU.
 
     Args:
@@ -145,9 +144,10 @@ def _redraw(
     scatter, near = _measure_scatter(belief, i, object_model)
     weights = belief.log_weights[i].detach().cpu().double().softmax(0)
     mass = float(weights[near].sum())
-    own = max(round(count * mass), min(count, _FEWEST_DRAWS))
+    own = max(round(count * mass), _FEWEST_DRAWS)
     rest = count - own
-    mass = max(mass, own / count) if rest else 1.0
+    if own == _FEWEST_DRAWS or not rest:  # few particles are near the estimate, or all are
+        mass = max(mass, own / count)
     twist = factor * draw_student_t(own) @ torch.linalg.cholesky(scatter).mT / _unit(object_model)
     best = belief.best[i].detach().cpu().double()
     poses = move_about(best, twist, object_model.center.detach().cpu().double())
@@ -162,10 +162,11 @@ def _redraw(
     return poses, log_weights
 
 
-def draw_student_t(count: int, seed: int = 0) -> Tensor:
+def draw_student_t(count: int, seed: int = _SEED) -> Tensor:
     """Return draws (count, 6) of Student's t about 0, in opposite pairs.
 
-    Their second moment is exactly that of the distribution, 5/3 along each axis.
+    Their second moment is exactly that of the distribution, 5/3 along each axis.  Pairs follow each
+    other, so that the first ones are as good as all.
 
     Args:
         count: 32 at least.
@@ -177,7 +178,7 @@ def draw_student_t(count: int, seed: int = 0) -> Tensor:
         (len(half), int(_DEGREES)), generator=generator, dtype=torch.float64
     ).square()
     half = half * (_DEGREES / squares.sum(1, keepdim=True)).sqrt()
-    draws = torch.cat([half, -half])[:count]
+    draws = torch.stack([half, -half], dim=1).flatten(0, 1)[:count]
     own = torch.linalg.cholesky(draws.mT @ draws / count)
     wanted = math.sqrt(_DEGREES / (_DEGREES - 2))
     return wanted * torch.linalg.solve_triangular(own, draws.mT, upper=False).mT

@@ -294,9 +294,7 @@ class PoseEstimator(Module):
             return belief
         assert found.features is not None
         right = self.calibration.assess(found.features).probability  # within the default tolerance
-        return calibrate_belief(
-            belief, right, self.calibration.belief_scale, self.object_model
-        )
+        return calibrate_belief(belief, right, self.calibration.belief_scale, self.object_model)
 
     # -- training ---------------------------------------------------------------------------------
 

@@ -1,0 +1,230 @@
+"""A calibrated belief is as wide as the errors of right estimates, however wide the filter's is."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from posefilter import Belief
+from posefilter.cli.calibrate import Beliefs, fit_beliefs
+from posefilter.confidence.belief_scale import (
+    BeliefScale,
+    calibrate_belief,
+    draw_student_t,
+    fit_belief_scale,
+    measure_spread,
+)
+from posefilter.confidence.calibration import Calibration, read_calibration
+from posefilter.confidence.logistic import Logistic
+from posefilter.errors import UserError
+from posefilter.geometry.pose import make_pose, move_about
+from posefilter.geometry.rotation import exp_so3, random_rotation
+from posefilter.metrics.credibility import score_truth
+from posefilter.types import BeliefBatch, ObjectModel
+
+CENTER = torch.tensor([0.01, -0.02, 0.03], dtype=torch.float64)
+RADIUS, DIAMETER = 0.1, 0.19
+# of errors, a turn as the shift at the radius [m]: uncertain along the view, sure of one turn
+ROOT = torch.diag(torch.tensor([2e-3, 2e-3, 5e-3, 4e-3, 1e-3, 3e-3], dtype=torch.float64))
+ROOT[2, 3] = 2e-3
+
+
+def model(symmetries: Tensor | None = None) -> ObjectModel:
+    points = torch.randn(30, 3, generator=torch.Generator().manual_seed(1)).double() * 0.05
+    group = torch.eye(4, dtype=torch.float64)[None] if symmetries is None else symmetries
+    return ObjectModel("thing", points, CENTER, RADIUS, DIAMETER, group, points)
+
+
+def move(pose: Tensor, twist: Tensor) -> Tensor:
+    """Move poses by twists whose turn is a shift at the radius."""
+    return move_about(pose, twist / twist.new_tensor([1.0] * 3 + [RADIUS] * 3), CENTER)
+
+
+def simulate(count: int, too_wide: float, slope: float, seed: int = 0) -> tuple[Beliefs, Tensor]:
+    """Return beliefs whose particles are too wide by a factor, and what is said of them: errors
+    shrink with the logit of the probability by `slope`.
+    """
+    generator = torch.Generator().manual_seed(seed)
+    logit = torch.rand(count, generator=generator, dtype=torch.float64) * 6 - 1
+    rotation = random_rotation(count, generator=generator).double()
+    best = make_pose(rotation, torch.tensor([0.1, 0.0, 0.8], dtype=torch.float64).expand(count, 3))
+    error = torch.stack([draw_student_t(32, seed=1000 * seed + k)[0] for k in range(count)])
+    error = error * (slope * logit).exp()[:, None] @ ROOT.mT
+    noise = torch.randn((count, 200, 6), generator=generator, dtype=torch.float64)
+    poses = move(best[:, None], too_wide * noise @ ROOT.mT)
+    beliefs = BeliefBatch(
+        poses, torch.full((count, 200), -math.log(200)).double(), best, torch.zeros(count)
+    )
+    return Beliefs(beliefs, move(best, error)), logit.sigmoid()
+
+
+@pytest.mark.parametrize("too_wide", [0.3, 1.0, 4.0])
+def test_the_scale_of_simulated_errors_is_found(too_wide: float) -> None:
+    (beliefs, truth), probability = simulate(300, too_wide, slope=-0.15)
+    found = fit_belief_scale(measure_spread(beliefs, truth, model()), probability)
+    assert found is not None
+    # of 200 particles and the prior of 4 there is a little bias
+    assert found.bias == pytest.approx(-math.log(too_wide), abs=0.25)
+    assert found.slope == pytest.approx(-0.15, abs=0.05)
+
+
+@pytest.mark.parametrize("too_wide", [0.3, 4.0])
+def test_sets_and_ellipsoids_of_new_frames_hold_the_truth_as_often_as_they_say(
+    too_wide: float,
+) -> None:
+    (beliefs, truth), probability = simulate(120, too_wide, slope=-0.2)
+    scale, _ = fit_beliefs(Beliefs(beliefs, truth), probability, np.ones(120, bool), model())
+    assert scale is not None
+    (new, new_truth), said = simulate(150, too_wide, slope=-0.2, seed=7)
+    before = score_truth(new, new_truth, model())
+    after_belief = calibrate_belief(new, said, scale, model())
+    after = score_truth(after_belief, new_truth, model())
+    assert float(after.log_density.mean()) > float(before.log_density.mean()) + 1
+    error = math.sqrt(0.25 / 150)
+    for level in (0.5, 0.9):
+        # kernels of 200 draws make sets a little too small, see docs/results/confidence.md
+        share = float((after.rank < level).double().mean())
+        assert level - 0.12 - 2 * error < share < level + 2 * error
+        assert abs(float((before.rank < level).double().mean()) - level) > abs(share - level)
+    spread = measure_spread(after_belief, new_truth, model())
+    inside = (
+        torch.linalg.solve(spread.scatter, spread.twist[..., None])[..., 0] * spread.twist
+    ).sum(1)
+    # of Student's t, over its variance: the median of 6 F(6, 5) is 5.8, times 3 / 5
+    assert 0.35 < float((inside < 3.5).double().mean()) < 0.65
+
+
+def test_a_fit_takes_right_estimates_alone_and_few_of_them_give_none() -> None:
+    (beliefs, truth), probability = simulate(40, 1.0, slope=-0.2)
+    right = np.arange(40) < 30
+    far = truth.clone()
+    far[30:, 2, 3] += 1.0
+    with_wrong, score = fit_beliefs(Beliefs(beliefs, far), probability, right, model())
+    without, _ = fit_beliefs(
+        Beliefs(beliefs, truth).select(np.arange(30)), probability[:30], right[:30], model()
+    )
+    assert with_wrong == without
+    assert np.median(score[30:]) > np.median(score[:30]) + 5
+    few = np.arange(40) < 9
+    none, plain = fit_beliefs(Beliefs(beliefs, truth), probability, few, model())
+    assert none is None
+    own = score_truth(beliefs, truth, model()).nonconformity.numpy()
+    assert plain == pytest.approx(own)
+
+
+def test_draws_have_the_moments_of_the_distribution_and_are_always_the_same() -> None:
+    for count in (32, 200, 201):
+        draws = draw_student_t(count)
+        assert draws.shape == (count, 6)
+        assert torch.allclose(
+            draws.mT @ draws / count, torch.eye(6, dtype=torch.float64) * 5 / 3, atol=1e-9
+        )
+        assert torch.equal(draws, draw_student_t(count))
+    half = draw_student_t(200)
+    assert torch.equal(half[::2], -half[1::2])
+    tail = draw_student_t(20_000).square().sum(1)
+    # P(F(6, 5) < 4.95) = 0.95
+    assert float((tail < 6 * 4.95).double().mean()) == pytest.approx(0.95, abs=0.01)
+
+
+def test_the_covariance_about_the_estimate_is_that_of_the_model() -> None:
+    (beliefs, truth), probability = simulate(3, 2.0, slope=0)
+    scale = BeliefScale(bias=-0.5, slope=-0.1)
+    out = calibrate_belief(beliefs, probability, scale, model())
+    assert torch.equal(out.best, beliefs.best) and torch.equal(out.score, beliefs.score)
+    scatter = measure_spread(beliefs, truth, model()).scatter
+    factor = scale.find_factor(probability)
+    for i in range(3):
+        weights = out.log_weights[i].exp()
+        own = Belief(out.poses[i].numpy(), weights.numpy(), CENTER.numpy(), RADIUS, DIAMETER)
+        unit = np.array([1.0] * 3 + [RADIUS] * 3)
+        found = own.covariance_about(beliefs.best[i].numpy()) * unit[:, None] * unit
+        wanted = (5 / 3 * factor[i] ** 2 * scatter[i]).numpy()
+        assert found == pytest.approx(wanted, abs=1e-3 * float(wanted.max()))
+
+
+def test_hypotheses_elsewhere_keep_their_poses_and_their_mass() -> None:
+    (beliefs, _), probability = simulate(1, 1.0, slope=0)
+    poses, log_weights = beliefs.poses.clone(), torch.zeros(1, 200, dtype=torch.float64)
+    half_turn = torch.eye(4, dtype=torch.float64)
+    half_turn[:3, :3] = exp_so3(torch.tensor([0.0, math.pi, 0.0], dtype=torch.float64))
+    poses[0, :60] = poses[0, :60] @ half_turn
+    log_weights[0, :60] = math.log(2)
+    given = beliefs._replace(poses=poses, log_weights=log_weights.log_softmax(1))
+    out = calibrate_belief(given, probability, BeliefScale(0.0, 0.0), model())
+    weights = out.log_weights[0].exp()
+    kept = (out.poses[0, :, None] - poses[0, None, :60]).abs().amax((2, 3)).amin(1) < 1e-12
+    mass = 120 / 260
+    assert float(weights.sum()) == pytest.approx(1)
+    assert float(weights[kept].sum()) == pytest.approx(mass, abs=1e-6)
+    # systematic: each is drawn once or twice
+    assert int(kept.sum()) == round(200 * mass)
+    # of a symmetric object they are the same pose
+    group = torch.stack([torch.eye(4, dtype=torch.float64), half_turn])
+    group[1, :3, 3] = CENTER - half_turn[:3, :3] @ CENTER
+    poses[0, :60] = beliefs.poses[0, :60] @ group[1]
+    same = calibrate_belief(
+        given._replace(poses=poses), probability, BeliefScale(0, 0), model(group)
+    )
+    centers = same.poses[0, :, :3, :3] @ CENTER + same.poses[0, :, :3, 3]
+    away = (same.poses[0, :, :3, :3].mT @ given.best[0, :3, :3]).diagonal(dim1=1, dim2=2).sum(1)
+    assert float(away.min()) > 1  # no half turn among them
+    assert float((centers - centers.mean(0)).norm(dim=1).median()) < 0.02
+
+
+def test_one_particle_and_none_near_the_estimate_become_a_belief_about_it() -> None:
+    best = torch.eye(4)[None]
+    for shift in (0.0, 1.0):
+        poses = best[:, None].clone()
+        poses[0, 0, 2, 3] += shift
+        lone = BeliefBatch(poses, torch.zeros(1, 1), best, torch.zeros(1))
+        out = calibrate_belief(lone, torch.ones(1), BeliefScale(0.0, 0.0), model())
+        assert out.poses.shape == (1, 200, 4, 4) and out.poses.dtype == torch.float32
+        weights = out.log_weights[0].exp()
+        near = out.poses[0, :, :3, 3].norm(dim=1) < 0.5
+        assert int(near.sum()) == (200 if shift == 0 else 32)
+        assert float(weights.sum()) == pytest.approx(1, abs=1e-5)
+        Belief(out.poses[0].numpy(), weights.numpy(), CENTER.numpy(), RADIUS, DIAMETER)
+
+
+def test_the_factor_is_limited_to_what_frames_can_tell() -> None:
+    scale = BeliefScale(0.1, -0.2)
+    said = torch.tensor([0.0, 0.5, 1.0])
+    assert scale.find_factor(said).log().tolist() == pytest.approx([1.1, 0.1, -0.9])
+
+
+def calibration(belief_scale: BeliefScale | None) -> Calibration:
+    one = Logistic((1.0,), 0.0)
+    counts = {"right": 10, "wrong": 2, "absent": 12}
+    return Calibration(
+        ("score",), (0.0,), (1.0,), one, one, counts, "fat", {}, belief_scale=belief_scale
+    )
+
+
+def test_a_scale_is_stored_and_read_and_older_calibrations_have_none() -> None:
+    plain = calibration(BeliefScale(-0.25, -0.125)).to_plain()
+    assert plain["belief_scale"] == {"bias": -0.25, "slope": -0.125}
+    assert read_calibration(plain, "x").belief_scale == BeliefScale(-0.25, -0.125)
+    del plain["belief_scale"]
+    assert read_calibration(plain, "x").belief_scale is None
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        [],
+        {"bias": 0.0},
+        {"bias": 0.0, "slope": 0.0, "more": 1.0},
+        {"bias": math.nan, "slope": 0.0},
+        {"bias": 11.0, "slope": 0.0},
+        {"bias": 0.0, "slope": -1e5},
+        {"bias": "0", "slope": 0.0},
+        {"bias": True, "slope": 0.0},
+    ],
+)
+def test_a_scale_that_is_none_is_refused(content: object) -> None:
+    plain = calibration(None).to_plain() | {"belief_scale": content}
+    with pytest.raises(UserError, match=r"x: its calibration .*belief_scale"):
+        read_calibration(plain, "x")
