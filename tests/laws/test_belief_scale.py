@@ -133,7 +133,8 @@ def test_the_covariance_about_the_estimate_is_that_of_the_model() -> None:
     (beliefs, truth), probability = simulate(3, 2.0, slope=0)
     scale = BeliefScale(bias=-0.5, slope=-0.1)
     out = calibrate_belief(beliefs, probability, scale, model())
-    assert torch.equal(out.best, beliefs.best) and torch.equal(out.score, beliefs.score)
+    assert torch.equal(out.best, beliefs.best)
+    assert torch.equal(out.score, beliefs.score)
     scatter = measure_spread(beliefs, truth, model()).scatter
     factor = scale.find_factor(probability)
     for i in range(3):
@@ -181,7 +182,8 @@ def test_one_particle_and_none_near_the_estimate_become_a_belief_about_it() -> N
         poses[0, 0, 2, 3] += shift
         lone = BeliefBatch(poses, torch.zeros(1, 1), best, torch.zeros(1))
         out = calibrate_belief(lone, torch.ones(1), BeliefScale(0.0, 0.0), model())
-        assert out.poses.shape == (1, 200, 4, 4) and out.poses.dtype == torch.float32
+        assert out.poses.shape == (1, 200, 4, 4)
+        assert out.poses.dtype == torch.float32
         weights = out.log_weights[0].exp()
         near = out.poses[0, :, :3, 3].norm(dim=1) < 0.5
         assert int(near.sum()) == (200 if shift == 0 else 32)

@@ -2,6 +2,7 @@
 
 import csv
 import json
+import math
 from pathlib import Path
 from typing import Any
 
@@ -248,6 +249,52 @@ def test_the_library_gives_what_the_command_gives(
     other = load(calibrated, overrides=["filter.particles=8"], device="cpu").predict(rgb, depth, K)
     assert other.probability is None
     assert "another filter" in other.calibration_note
+
+
+def plant_scale(path: Path, out: Path, bias: float) -> Path:
+    """Write a copy whose beliefs are as wide as the particles are, times exp(bias)."""
+    content = torch.load(path, weights_only=True)
+    content["calibration"]["belief_scale"] = {"bias": bias, "slope": 0.0}
+    torch.save(content, out)
+    return out
+
+
+def test_a_belief_is_as_wide_as_the_calibration_says_in_results_files_and_metrics(
+    calibrated: Path, tiny_scenes: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    stored = torch.load(calibrated, weights_only=True)["calibration"]
+    assert stored["belief_scale"] is None  # untrained: too few of its answers are right
+    photo = photograph(tiny_scenes)
+    files = [plant_scale(calibrated, tmp_path / f"{x}.ckpt", math.log(x)) for x in (1.0, 3.0)]
+    there = [plant(file, file, 9.0, 0.5) for file in files]
+    rgb = cv2.imread(photo[0].removeprefix("rgb="))[..., ::-1]
+    depth = np.tile(np.linspace(0.6, 0.8, rgb.shape[1]), (len(rgb), 1))
+    K = np.array([[266.0, 0, 78], [0, 266, 60], [0, 0, 1]])
+    plain = load(calibrated, device="cpu").predict(rgb, depth, K)
+    narrow, wide = (load(file, device="cpu").predict(rgb, depth, K) for file in there)
+    assert [one.belief_calibrated for one in (plain, narrow, wide)] == [False, True, True]
+    assert narrow.pose.tolist() == wide.pose.tolist() == plain.pose.tolist()
+    shares = [result.belief.covariance_about(result.pose) for result in (narrow, wide)]
+    assert np.diag(shares[1])[:3].sum() > np.diag(shares[0])[:3].sum()
+    several = load(there[0], device="cpu").predict(rgb, depth, K, instances=1)
+    assert not any(one.belief_calibrated for one in several)
+
+    for file, said in ((there[0], "if it is right"), (calibrated, "the particles")):
+        out = tmp_path / f"of_{file.stem}"
+        assert run_command("predict", HOME, [f"checkpoint={file}", *photo[:3], f"out={out}"]) < 2
+        told = json.loads((out / "pose.json").read_text())
+        if told["verdict"] != "absent":
+            assert f"{said}: within " in capfd.readouterr().out
+        assert ("not calibrated" in told["belief"]["belief_is"]) == (file == calibrated)
+
+    coverage = []
+    for file in there:
+        out = tmp_path / f"test_of_{file.stem}"
+        typed = [f"checkpoint={file}", f"data.root={tiny_scenes}", *QUIET, f"out={out}"]
+        typed += ["data.split={train: 0, val: 0, test: 1.0}"]
+        assert run_command("evaluate", HOME, typed) == 0
+        coverage.append(json.loads((out / "metrics.json").read_text())["belief"])
+    assert coverage[0] != coverage[1]
 
 
 def test_an_evaluation_reports_how_much_the_probability_tells(
