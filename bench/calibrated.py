@@ -31,7 +31,6 @@ import math
 import sys
 import time
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -39,8 +38,7 @@ import cv2
 import numpy as np
 import torch
 from checkpoint_frames import open_frames
-from confidence import read_tolerance
-from scipy.stats import f as f_distribution
+from confidence import measure_error, read_tolerance
 
 from posefilter.belief import Belief
 from posefilter.cli.checkpoints import method_of, read_checkpoint
@@ -52,7 +50,6 @@ from posefilter.figures.band import find_band, measure_cover
 from posefilter.figures.canvas import View
 from posefilter.geometry.camera import project
 from posefilter.geometry.pose import transform
-from posefilter.geometry.pose_statistics import twist_between
 from posefilter.metrics.confidence import calibration_error, error_at_coverage
 from posefilter.metrics.credibility import SHOWN, score_truth
 from posefilter.metrics.diagnostics import auroc
@@ -147,25 +144,6 @@ def measure_band(
     return 1 - 2 * missed / total if total else float("nan")
 
 
-def measure_error(
-    belief: Belief, estimate: np.ndarray, truth: np.ndarray
-) -> tuple[float, list[bool]]:
-    """Return how far the truth is from an estimate by the belief's covariance about it, as the
-    level of the smallest ellipsoid of Student's t that holds it; and whether it is within the
-    translation and the rotation of `Belief.uncertainty`.
-    """
-    near = replace(belief, samples=truth[None], weights=np.ones(1)).canonicalize(estimate)
-    about = torch.from_numpy(estimate)
-    twist = twist_between(about, torch.from_numpy(near.samples[0]), torch.from_numpy(belief.center))
-    error, spread = twist.numpy(), belief.covariance_about(estimate)
-    squared = float(error @ np.linalg.lstsq(spread, error, rcond=1e-9)[0])
-    level = float(f_distribution.cdf(squared * 5 / 3 / 6, 6, 5))
-    sure = belief.uncertainty()
-    off = (np.linalg.norm(error[:3]), np.linalg.norm(error[3:]))
-    pairs = zip(off, (sure.translation, sure.rotation), strict=True)
-    return level, [bool(one <= most) for one, most in pairs]
-
-
 def look(method: PoseEstimator, found: Observation, there: bool) -> Iterator[Row]:
     """Yield a row an image of what the method's calibration says of it."""
     object_model, calibration = method.object_model, method.calibration
@@ -200,9 +178,8 @@ def look(method: PoseEstimator, found: Observation, there: bool) -> Iterator[Row
                 row[f"{which}rank"] = float(scores.rank[i])
                 row[f"{which}log_density"] = float(scores.log_density[i])
                 estimate = of.best[i].double().numpy()
-                row[f"{which}level"], row[f"{which}within"] = measure_error(own, estimate, truth)
-                sure = own.uncertainty()
-                row[f"{which}says"] = [sure.translation, sure.rotation]
+                error = measure_error(own, estimate, truth)
+                row |= {f"{which}{key}": value for key, value in error.items()}
                 row[f"{which}band"] = measure_band(own, truth, hull, K, found.size)
         yield row
 

@@ -1,5 +1,5 @@
 """Look for every object in every photograph of a dataset, whether it is there or not, and count
-what calibrated checkpoints declare.
+what calibrated checkpoints declare, and what they say of the error of right answers.
 
     python bench/confidence.py --source ycb_video --root DIR --meshes DIR [--weights FILE ...]
         [--every 10] [--input depth_x2 ...] [--tolerance add_s=0.1] [--out FILE.json]
@@ -13,21 +13,26 @@ with the objects that a photograph shows, and counts the answers that are declar
 
 import argparse
 import json
+import math
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 from marked import format_row
+from scipy.stats import f as f_distribution
 
 import posefilter
+from posefilter.belief import Belief
 from posefilter.confidence.tolerance import RIGHT, PoseTolerance, measure_pose_errors
 from posefilter.data.frames import FrameRecord, Sample
 from posefilter.data.readers.base import BaseReader
 from posefilter.data.readers.registry import open_meshes, open_reader
 from posefilter.errors import UserError
+from posefilter.geometry.pose_statistics import twist_between
 from posefilter.result import Result
 
 Inputs = tuple[np.ndarray, np.ndarray, np.ndarray]
@@ -97,6 +102,29 @@ def is_right(result: Result, sample: Sample) -> bool:
     return bool((result.pose_tolerance or RIGHT).accepts(errors))
 
 
+def measure_error(belief: Belief, estimate: np.ndarray, truth: np.ndarray) -> dict[str, Any]:
+    """Return how far an estimate is off, and what its belief says of that.
+
+    Returns:
+        off: Translation of the center [m] and rotation [rad].  says: What `Belief.uncertainty`
+        gives for them at 95 %.  within: Whether each is within it.  level: Of the smallest
+        ellipsoid that holds the truth, of the covariance about the estimate and in the shape of
+        Student's t with 5 degrees of freedom.
+    """
+    near = replace(belief, samples=truth[None], weights=np.ones(1)).canonicalize(estimate)
+    about = torch.from_numpy(estimate)
+    twist = twist_between(about, torch.from_numpy(near.samples[0]), torch.from_numpy(belief.center))
+    error, spread = twist.numpy(), belief.covariance_about(estimate)
+    squared = float(error @ np.linalg.lstsq(spread, error, rcond=1e-9)[0])
+    sure = belief.uncertainty()
+    off = [float(np.linalg.norm(error[:3])), float(np.linalg.norm(error[3:]))]
+    says = [sure.translation, sure.rotation]
+    within = [one <= most for one, most in zip(off, says, strict=True)]
+    # the covariance is 5 / 3 times the distribution's scale
+    level = float(f_distribution.cdf(squared * 5 / 3 / 6, 6, 5))
+    return {"off": off, "says": says, "within": within, "level": level}
+
+
 def read_tolerance(words: list[str]) -> PoseTolerance | None:
     """Return the tolerance of words such as add_s=0.1; None where there are none."""
     pairs = (one.split("=") for one in words)
@@ -134,7 +162,10 @@ def look(
             row |= {"probability": probability_of(result), "presence": result.presence}
             row |= {"apparent_size": result.apparent_size, "wrong_size": result.wrong_size}
             if result.object in there:
-                row["right"] = is_right(result, there[result.object])
+                sample = there[result.object]
+                row["right"] = is_right(result, sample)
+                truth = sample.camera_from_object.astype(np.float64)
+                row |= measure_error(result.belief, result.pose, truth)
             rows.append(row)
             print(json.dumps(row), flush=True)
     return rows
@@ -153,6 +184,25 @@ def tabulate(rows: list[dict[str, Any]]) -> str:
         cells += [len(other), *(sum(r["verdict"] == v for r in other) for v in ("found", "unsure"))]
         cells.append(f"{max((row['probability'] for row in other), default=0):.2f}")
         lines.append(f"| {' | '.join(map(str, cells))} |")
+    return "\n".join(lines)
+
+
+def tabulate_errors(rows: list[dict[str, Any]]) -> str:
+    """Return what beliefs say of right estimates, and how far these are off, as a table."""
+    head = ("object", "right", "off, median", "said at 95 %, median", "within the translation")
+    lines = [format_row((*head, "the rotation", "ellipsoids of 50 and 95 %"))]
+    lines.append(format_row("---" for _ in range(len(head) + 2)))
+    own = [row for row in rows if row.get("right") and "off" in row]
+    for name in [*dict.fromkeys(row["object"] for row in own), "all"]:
+        some = [row for row in own if name in (row["object"], "all")]
+        pairs = (np.median([row[key] for row in some], axis=0) for key in ("off", "says"))
+        words = [
+            f"{1000 * shift:.1f} mm, {math.degrees(turn):.1f} degrees" for shift, turn in pairs
+        ]
+        within = np.sum([row["within"] for row in some], axis=0)
+        inside = [sum(row["level"] < level for row in some) for level in (0.5, 0.95)]
+        cells = [name, len(some), *words, *within, " and ".join(map(str, inside))]
+        lines.append(format_row(map(str, cells)))
     return "\n".join(lines)
 
 
@@ -196,7 +246,10 @@ def main() -> int:
     inputs = list(SPOILED) if options.input == "all" else [options.input]
     images = list_images(reader, options.every)
     rows = [row for spoil in inputs for row in look(estimator, reader, images, spoil)]
-    print(tabulate_spoiled(rows) if options.input == "all" else tabulate(rows))
+    if options.input == "all":
+        print(tabulate_spoiled(rows))
+    else:
+        print(tabulate(rows), tabulate_errors(rows), sep="\n\n")
     if options.out is not None:
         options.out.write_text(json.dumps(rows, indent=1) + "\n")
     return 0
