@@ -320,7 +320,8 @@ def divide(rows: Sequence[Row]) -> Iterator[tuple[str, list[Row]]]:
     """Yield groups of rows with their names: objects, all, visibility, what is shown."""
     for name in dict.fromkeys(row["object"] for row in rows):
         yield name, [row for row in rows if row["object"] == name]
-    yield "all", list(rows)
+    if rows:
+        yield "all", list(rows)
     for key in ("visibility", "shown"):
         for low in QUARTERS:
             high = low + 0.25 if low < 0.75 else 2

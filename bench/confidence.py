@@ -193,7 +193,7 @@ def tabulate_errors(rows: list[dict[str, Any]]) -> str:
     lines = [format_row((*head, "the rotation", "ellipsoids of 50 and 95 %"))]
     lines.append(format_row("---" for _ in range(len(head) + 2)))
     own = [row for row in rows if row.get("right") and "off" in row]
-    for name in [*dict.fromkeys(row["object"] for row in own), "all"]:
+    for name in [*dict.fromkeys(row["object"] for row in own), "all"] if own else []:
         some = [row for row in own if name in (row["object"], "all")]
         pairs = (np.median([row[key] for row in some], axis=0) for key in ("off", "says"))
         words = [

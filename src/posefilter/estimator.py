@@ -174,7 +174,10 @@ class Estimator:
         return out
 
     def run(self, images: Images, seed: int = 0) -> list[Run]:
-        """Run each object's filter, and return every step of it: for figures of what it did."""
+        """Run each object's filter, and return every step of it: for figures of what it did.
+
+        The trace's belief is the calibrated one, where there is one.
+        """
         seed = check_seed(seed)
         runs, blank = [], list_blank(images)
         for method, size in zip(self.methods, self._sizes, strict=True):

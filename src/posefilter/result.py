@@ -43,9 +43,9 @@ class Result:
         presence: That the object is there, whatever the pose: at least `probability`, or None.
         pose_tolerance: What a right pose is, which the verdict goes by; None: what `probability` is
             of.  See `probability_within`.
-        belief: Weighted poses.  Where `belief_calibrated` they are about the estimate, as wide as
-            the error of a right estimate is, which holds with `probability`; else every particle
-            and its weight, as the filter leaves them.
+        belief: Weighted poses.  Where `belief_calibrated`, those about the estimate are draws as
+            wide as the errors of right estimates are, and the others are particles, which stand for
+            other hypotheses; else every particle and its weight, as the filter leaves them.
         warnings: What makes the estimate implausible, in words; empty where nothing does.
         apparent_size: How large the object appears, relative to its mesh: 1 where the depth and the
             intrinsics are right.  NaN where the method cannot tell, or too few pixels show it.
@@ -63,8 +63,8 @@ class Result:
         depth_inlier_fraction: The fraction of the object's surface points, those that face away
             included, whose depth at the pose agrees with the measured one.  Earlier calibrations
             choose the group of a conformal set by it, under the name `surface`.
-        belief_calibrated: Whether the belief's width is calibrated, as of one image it is; not of
-            instances and of tracks, and by an earlier version's calibration.
+        belief_calibrated: Whether the belief's width is calibrated.  It is not of instances and
+            tracks, nor by a calibration of an earlier version or of too few right estimates.
         instance: Which of its class it is, from 0, the most probable first.
         mask: The pixels (H, W) bool of the image that are its own, where instances were asked for;
             else None.

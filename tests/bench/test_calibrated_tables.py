@@ -11,7 +11,9 @@ import pytest
 import torch
 from tests.models.toy import scenes
 
+from posefilter.belief import Belief
 from posefilter.confidence.tolerance import PoseTolerance
+from posefilter.types import BeliefBatch
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "bench"))  # scripts import their neighbors
 Load = Callable[[str], ModuleType]
@@ -20,6 +22,12 @@ Load = Callable[[str], ModuleType]
 @pytest.fixture
 def bench(load_script: Load) -> ModuleType:
     return load_script("bench/calibrated.py")
+
+
+def belief() -> BeliefBatch:
+    """Return a belief of one particle about one image."""
+    pose = torch.eye(4)[None]
+    return BeliefBatch(pose[:, None], torch.zeros(1, 1), pose, torch.zeros(1))
 
 
 def row(there: bool, probability: float, right: bool = False, **more: Any) -> dict[str, Any]:
@@ -60,9 +68,9 @@ def test_shown_is_visible_and_in_the_frame(bench: ModuleType) -> None:
     pose[0, 2, 3] = 1.0
     width = batch.depth.shape[-1]
     K = torch.tensor([[[1e3, 0.0, width - 5.0], [0.0, 1e3, 5.0], [0.0, 0.0, 1.0]]])
-    seen = batch._replace(
-        camera_from_object=pose, intrinsics=K, visibility=torch.tensor([0.6])
-    )  # one of the points lies ten pixels to the left, the other beyond the right edge
+    # one of the points lies ten pixels to the left, the other beyond the right edge
+    size = (batch.depth.shape[-2], width)
+    seen = bench.Observation(belief(), {}, pose, K, torch.tensor([0.6]), size, ("a",))
     assert float(bench.measure_shown(seen, wide)) == pytest.approx(0.3)
 
 
@@ -73,14 +81,45 @@ def test_the_band_of_a_belief_at_the_truth_holds_the_outline_and_one_beside_it_d
     hull = np.random.default_rng(0).normal(size=(60, 3)) * 0.03
     truth = np.eye(4)
     truth[2, 3] = 1.0
-    pixels = batch.depth.shape[-1]
-    K = torch.tensor([[[pixels, 0.0, pixels / 2], [0.0, pixels, pixels / 2], [0.0, 0.0, 1.0]]])
-    one = batch._replace(intrinsics=K)
+    height, pixels = batch.depth.shape[-2:]
+    K = np.array([[pixels, 0.0, pixels / 2], [0.0, pixels, pixels / 2], [0.0, 0.0, 1.0]])
     beside = truth.copy()
     beside[0, 3] = 0.2
     for pose, least, most in ((truth, 1.0, 1.0), (beside, -1.0, 0.2)):
-        held = bench.measure_band(pose[None], np.ones(1), truth, hull, one)
+        one = Belief(pose[None], np.ones(1), np.zeros(3), 0.1, 0.2)
+        held = bench.measure_band(one, truth, hull, K, (height, pixels))
         assert least <= held <= most
+
+
+def test_what_a_filter_leaves_is_kept_and_read_again(bench: ModuleType, tmp_path: Path) -> None:
+    poses, K = torch.eye(4).expand(2, 4, 4), torch.eye(3).expand(2, 3, 3)
+    features = {"score": torch.tensor([1.0, 2.0]), "surface": torch.tensor([0.5, torch.nan])}
+    many = BeliefBatch(*(torch.cat([part, part]) for part in belief()))
+    shown = torch.tensor([0.1, 0.2])
+    given = bench.Observation(many, features, poses, K, shown, (120, 160), ("a", "b"))
+    bench.save_observation(given, tmp_path / "thing.with.0000.npz")
+    assert [file.name for file in tmp_path.iterdir()] == ["thing.with.0000.npz"]
+    again = bench.load_observation(tmp_path / "thing.with.0000.npz")
+    assert again[5:] == given[5:]
+    assert list(again.features) == list(features)
+    pairs = [*zip(again.belief, many, strict=True), *zip(again[2:5], given[2:5], strict=True)]
+    pairs += [(again.features[key], features[key]) for key in features]
+    for a, b in pairs:
+        assert torch.equal(a.nan_to_num(7.0), b.nan_to_num(7.0))
+
+
+def test_beliefs_of_right_answers_are_counted_both_ways(bench: ModuleType) -> None:
+    own = {"off": [0.001, 0.1], "says": [0.002, 0.05], "within": [True, False], "level": 0.6}
+    own |= {"log_density": 3.0}
+    plain = {f"plain_{key}": value for key, value in own.items()}
+    plain |= {"plain_level": 0.99, "plain_rank": 0.97, "plain_band": 0.5}
+    rows = [row(True, 0.9, True, **own, **plain), row(True, 0.1), row(False, 0.1)]
+    table = [line.split(" | ") for line in bench.tabulate_beliefs(rows).splitlines()]
+    calibrated, filtered = (line[2:] for line in table if line[0] == "| all")
+    assert calibrated[:4] == ["1", *["0 / 100 / 100 / 100"] * 2, "100 / 0"]
+    assert calibrated[4:] == ["2.0 mm, 2.9", "100", "3.0 |"]
+    assert filtered[:3] == ["1", *["0 / 0 / 0 / 0"] * 2]
+    assert len(bench.tabulate_beliefs(rows[1:]).splitlines()) == 2  # none is right
 
 
 def test_each_scene_is_judged_by_the_others(bench: ModuleType) -> None:

@@ -5,8 +5,12 @@ from types import ModuleType
 
 import numpy as np
 import pytest
+import torch
+from scipy.stats import f as f_distribution
 
+from posefilter.belief import Belief
 from posefilter.data.frames import Sample
+from posefilter.geometry.pose import move_about
 
 
 def sample(seed: int) -> Sample:
@@ -49,3 +53,37 @@ def test_the_table_counts_refused_and_confidently_wrong_answers(bench: ModuleTyp
     ]
     lines = [line for line in bench.tabulate_spoiled(rows).splitlines() if "depth_x2" in line]
     assert lines == ["| depth_x2 | 3 | 1 | 1 | 1 | 1 | 0.90 | 1 |"]
+
+
+def test_an_error_is_measured_in_the_units_of_the_belief(bench: ModuleType) -> None:
+    # center 1 mm and turn 0.02 rad to either side, on each axis
+    steps = np.repeat(np.array([1e-3, 0.02]), 3)
+    twists = torch.from_numpy(np.concatenate([np.diag(steps), -np.diag(steps)]))
+    center = torch.tensor([0.01, 0.02, 0.03], dtype=torch.float64)
+    estimate = torch.eye(4, dtype=torch.float64)
+    half_turn = torch.diag(torch.tensor([-1.0, -1.0, 1.0, 1.0], dtype=torch.float64))
+    half_turn[:3, 3] = center - half_turn[:3, :3] @ center
+    group = torch.stack([torch.eye(4, dtype=torch.float64), half_turn])
+    poses = move_about(estimate, twists, center).numpy()
+    belief = Belief(poses, np.full(12, 1 / 12), center.numpy(), 0.1, 0.2, "", group.numpy())
+    twist = torch.tensor([2e-3, 0, 0, 0, 0, 0.01], dtype=torch.float64)
+    truth = move_about(estimate, twist, center) @ half_turn
+    said = bench.measure_error(belief, estimate.numpy(), truth.numpy())
+    assert said["off"] == pytest.approx([2e-3, 0.01])
+    assert said["says"] == pytest.approx([1e-3, 0.02], rel=1e-3)
+    assert said["within"] == [False, True]
+    # the covariance is a sixth of the squared steps
+    squared = 6 * (2**2 + 0.5**2)
+    assert said["level"] == pytest.approx(f_distribution.cdf(squared * 5 / 3 / 6, 6, 5), abs=1e-4)
+
+
+def test_errors_of_right_answers_alone_are_counted(bench: ModuleType) -> None:
+    row = {"object": "box", "right": True, "off": [1e-3, 0.1], "says": [2e-3, 0.05]}
+    row |= {"within": [True, False], "level": 0.6}
+    rows = [row, row | {"right": False, "off": [9.0, 9.0]}, {"object": "can"}]
+    lines = bench.tabulate_errors(rows).splitlines()
+    assert lines[2:] == [
+        f"| {name} | 1 | 1.0 mm, 5.7 degrees | 2.0 mm, 2.9 degrees | 1 | 0 | 0 and 1 |"
+        for name in ("box", "all")
+    ]
+    assert len(bench.tabulate_errors(rows[1:]).splitlines()) == 2  # none is right

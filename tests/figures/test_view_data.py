@@ -88,6 +88,18 @@ def test_pixels_are_shown_where_they_are_and_their_poses_too() -> None:
     assert np.allclose(shown.moments[-1].poses, trace.belief.poses[1])
 
 
+def test_a_calibrated_belief_is_shown_where_its_own_poses_are() -> None:
+    trace = run(pixels=True)
+    few = trace.belief._replace(
+        poses=trace.belief.poses[:, :5], log_weights=torch.full((2, 5), 0.2).log()
+    )
+    given = (trace._replace(belief=few), two_images(), box(), PixelSpace(), box().hull)
+    last = collect_view_data(*given, image=1, calibrated=True).moments[-1]
+    ahead = last.centers @ two_images().intrinsics[1].double().numpy().T
+    assert last.pixels.shape == (5, 2)
+    assert np.allclose(last.pixels, ahead[:, :2] / ahead[:, 2:])
+
+
 def test_hypotheses_have_their_shares_and_the_estimate_stands_for_its_own() -> None:
     shown, at = second(), hypotheses_of_belief().double()
     # as refined, not as some particle has it

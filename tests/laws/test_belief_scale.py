@@ -191,6 +191,24 @@ def test_one_particle_and_none_near_the_estimate_become_a_belief_about_it() -> N
         Belief(out.poses[0].numpy(), weights.numpy(), CENTER.numpy(), RADIUS, DIAMETER)
 
 
+def test_where_an_estimate_is_not_finite_the_particles_stay() -> None:
+    (beliefs, truth), probability = simulate(12, 1.0, slope=0)
+    best = beliefs.best.clone()
+    best[1] = torch.nan
+    log_weights = torch.full((12, 200), -1e9, dtype=torch.float64)
+    log_weights[:, 3], log_weights[:, 7] = math.log(0.25), math.log(0.75)
+    given = beliefs._replace(best=best, log_weights=log_weights)
+    out = calibrate_belief(given, probability, BeliefScale(0.0, 0.0), model())
+    assert torch.equal(out.poses[1, :50], beliefs.poses[1, [3]].expand(50, 4, 4))
+    assert torch.equal(out.poses[1, 50:], beliefs.poses[1, [7]].expand(150, 4, 4))
+    assert float(out.log_weights.exp().sum(1).sub(1).abs().max()) < 1e-9
+    # one does not keep the others from being calibrated
+    right = np.arange(12) != 1
+    scale, surprise = fit_beliefs(Beliefs(given, truth), probability, right, model())
+    assert scale is not None
+    assert np.isfinite(surprise).all()
+
+
 def test_the_factor_is_limited_to_what_frames_can_tell() -> None:
     scale = BeliefScale(0.1, -0.2)
     said = torch.tensor([0.0, 0.5, 1.0])

@@ -208,12 +208,13 @@ def fit_beliefs(
         probability: (n,) of each, by a calibration that has not seen it.
         right: (n,) bool, whether the estimate is right.
         object_model: The object.
-        folds: Each frame's belief is calibrated by a fit to the other parts.
+        folds: Each frame's belief is calibrated by a fit to the other parts, or to all where these
+            have too few right estimates.
         seed: Of their shuffle.
 
     Returns:
         The scale of all frames, None where too few are right; and (n,) [nat], of the beliefs as
-        they are where a fit has too few.
+        the filter leaves them where there is no scale.
     """
     spread = measure_spread(*beliefs, object_model)
 

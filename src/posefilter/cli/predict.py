@@ -95,7 +95,9 @@ def predict_one(job: Job) -> list[Result]:
     write_json(folder / "pose.json", answer)
     if cfg.save_rerun:
         model, space = method.object_model, method.space
-        record(collect_view_data(run.trace, run.batch, model, space, shape), folder / VIEW)
+        known = run.calibrated
+        view = collect_view_data(run.trace, run.batch, model, space, shape, calibrated=known)
+        record(view, folder / VIEW)
     if cfg.console != JSON:
         print_result(result)
     files = {"pose": folder / "pose.json", "overlay": folder / "overlay.png"}

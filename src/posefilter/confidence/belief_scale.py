@@ -124,7 +124,8 @@ def calibrate_belief(
 
     Returns:
         B beliefs of as many particles, 200 at least, with the same estimates and scores.  The
-        draws are always the same ones, moved, so that the same input has the same belief.
+        draws are always the same ones, moved, so that the same input has the same belief.  Where an
+        estimate is not finite they are the particles alone.
     """
     factors = scale.find_factor(probability.detach().cpu())
     count = max(belief.log_weights.shape[1], _FEWEST_PARTICLES)
@@ -141,25 +142,34 @@ def _redraw(
     belief: BeliefBatch, i: int, factor: float, count: int, object_model: ObjectModel
 ) -> tuple[Tensor, Tensor]:
     """Return the poses (count, 4, 4) and log weights (count,) of one calibrated belief, float64."""
-    scatter, near = _measure_scatter(belief, i, object_model)
+    best, poses = (x[i].detach().cpu().double() for x in (belief.best, belief.poses))
     weights = belief.log_weights[i].detach().cpu().double().softmax(0)
+    if not bool(best.isfinite().all()):  # no estimate: the particles are all that is known
+        even = torch.full((count,), -math.log(count), dtype=torch.float64)
+        return _resample(poses, weights, count), even
+    scatter, near = _measure_scatter(belief, i, object_model)
     mass = float(weights[near].sum())
     own = max(round(count * mass), _FEWEST_DRAWS)
     rest = count - own
     if own == _FEWEST_DRAWS or not rest:  # few particles are near the estimate, or all are
         mass = max(mass, own / count)
     twist = factor * draw_student_t(own) @ torch.linalg.cholesky(scatter).mT / _unit(object_model)
-    best = belief.best[i].detach().cpu().double()
-    poses = move_about(best, twist, object_model.center.detach().cpu().double())
+    drawn = move_about(best, twist, object_model.center.detach().cpu().double())
     log_weights = torch.full((count,), math.log(mass / own), dtype=torch.float64)
     if rest:
         log_weights[own:] = math.log((1 - mass) / rest)
-        # systematic resampling of the other hypotheses
-        ladder = weights.masked_fill(near, 0).cumsum(0)
-        steps = (torch.arange(rest, dtype=torch.float64) + 0.5) / rest * ladder[-1]
-        chosen = torch.searchsorted(ladder, steps).clamp_max(len(weights) - 1)
-        poses = torch.cat([poses, belief.poses[i].detach().cpu().double()[chosen]])
-    return poses, log_weights
+        drawn = torch.cat([drawn, _resample(poses, weights.masked_fill(near, 0), rest)])
+    return drawn, log_weights
+
+
+def _resample(poses: Tensor, weights: Tensor, count: int) -> Tensor:
+    """Return some of N poses by systematic resampling, each as often as its weight says.
+
+    (N, 4, 4), (N,) >= 0 -> (count, 4, 4).
+    """
+    ladder = weights.cumsum(0)
+    steps = (torch.arange(count, dtype=torch.float64) + 0.5) / count * ladder[-1]
+    return poses[torch.searchsorted(ladder, steps).clamp_max(len(weights) - 1)]
 
 
 def draw_student_t(count: int, seed: int = _SEED) -> Tensor:
@@ -196,10 +206,10 @@ def _measure_scatter(
     twist = _twist_near(best, poses, object_model) * _unit(object_model)
     near = (twist.norm(dim=1) < object_model.radius) & (weights > 0)
     share = weights * near
-    own = float(share.sum()) ** 2 / max(float(share.square().sum()), 1e-300)  # effective number
+    count = float(share.sum()) ** 2 / max(float(share.square().sum()), 1e-300)  # effective
     moment = (share[:, None] * twist).mT @ twist / share.sum().clamp_min(1e-300)
     prior = (_PRIOR_ERROR * object_model.diameter) ** 2 * torch.eye(6, dtype=torch.float64)
-    return (own * moment + _PRIOR_COUNT * prior) / (own + _PRIOR_COUNT), near
+    return (count * moment + _PRIOR_COUNT * prior) / (count + _PRIOR_COUNT), near
 
 
 def _twist_near(best: Tensor, poses: Tensor, object_model: ObjectModel) -> Tensor:

@@ -79,9 +79,19 @@ def collect_view_data(
     space: Space,
     shape: Shape,
     image: int = 0,
+    calibrated: bool = False,
 ) -> ViewData:
-    """Gather what is shown of one of a trace's images.  shape: the object's mesh, or the vertices
-    of its hull [m].
+    """Gather what is shown of one of a trace's images.
+
+    Args:
+        trace: A finished run of the filter.
+        batch: Its images.
+        object_model: The object.
+        space: Of the particles.
+        shape: The object's mesh, or the vertices of its hull [m].
+        image: Which of the images.
+        calibrated: Whether the trace's belief is calibrated, so that its poses are not those of the
+            last particles.
     """
     K = batch.intrinsics[image].detach().cpu().double()
     center = object_model.center.detach().cpu().double()
@@ -99,7 +109,8 @@ def collect_view_data(
         moments.append(
             make_moment(output.pose[image], particles.log_weights[image], pixels, center, K, sigma)
         )
-    last = None if isinstance(space, PoseSpace) else trace.particles[-1].state[image]
+    at_centers = calibrated or isinstance(space, PoseSpace)
+    last = None if at_centers else trace.particles[-1].state[image]
     moments.append(
         make_moment(belief.poses[image], belief.log_weights[image], last, center, K, None)
     )

@@ -5,9 +5,8 @@ import math
 import torch
 from torch import Tensor
 
-from posefilter.geometry.pose import rotation_of, translation_of
-from posefilter.geometry.pose_twists import pair_twists, split_poses
-from posefilter.geometry.rotation import exp_so3, log_so3
+from posefilter.geometry.pose import origin_of, rotation_of, transform, translation_of
+from posefilter.geometry.rotation import exp_so3, log_so3, quat_xyzw_from_matrix
 
 # [rad] a group whose least turn is smaller stands for a continuous symmetry
 _CONTINUOUS = math.radians(15.0)
@@ -62,10 +61,11 @@ def gather_copies(
     """
     if len(group) == 1:
         return poses
-    copies = poses[:, None] @ group
-    twist = pair_twists(
-        split_poses(about[None], center), split_poses(copies.flatten(0, 1), center)
-    )[0]
-    unit = twist.new_tensor([1.0] * 3 + [radius] * 3)
-    nearest = (twist * unit).square().sum(-1).view(len(poses), -1).argmin(1)
-    return copies[torch.arange(len(poses), device=poses.device), nearest]
+    # N S matrices would take long: an angle takes no more than the real part of a quaternion
+    relative = quat_xyzw_from_matrix(rotation_of(about).mT @ rotation_of(poses))
+    turns = quat_xyzw_from_matrix(rotation_of(group))
+    real = relative @ (turns * turns.new_tensor([-1.0, -1.0, -1.0, 1.0])).mT  # of their products
+    arc = 2 * radius * real.abs().clamp_max(1).acos()
+    shift = transform(poses, origin_of(group, center)) - origin_of(about, center)
+    nearest = (shift.square().sum(-1) + arc.square()).argmin(1)
+    return poses @ group[nearest]
