@@ -40,6 +40,8 @@ import torch
 from checkpoint_frames import open_frames
 from confidence import measure_error, read_tolerance
 
+from scipy.stats import kstest
+
 from posefilter.belief import Belief
 from posefilter.cli.checkpoints import method_of, read_checkpoint
 from posefilter.confidence.fit import Frames, fit_calibration
@@ -348,11 +350,12 @@ def tabulate_beliefs(rows: Sequence[Row]) -> str:
                     f"{1000 * translation:.1f} mm, {math.degrees(rotation):.1f}",
                     f"{100 * float(np.nanmean([row[f'{which}band'] for row in some])):.0f}",
                     f"{np.mean([row[f'{which}log_density'] for row in some]):.1f}",
+                    f"{kstest([row[f'{which}level'] for row in some], 'uniform').pvalue:.3f}",
                 ]
             )
     head = ["right frames of", "belief", "frames", f"ellipsoids of {LEVELS} %", "credible sets"]
     head += ["within what it says at 95 %: shift / turn", "which is in the median", "in the band"]
-    return draw_table([*head, "log density"], lines)
+    return draw_table([*head, "log density", "levels uniform: p"], lines)
 
 
 def tell_presence(rows: Sequence[Row], min_shown: float) -> str:

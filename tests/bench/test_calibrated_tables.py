@@ -117,7 +117,7 @@ def test_beliefs_of_right_answers_are_counted_both_ways(bench: ModuleType) -> No
     table = [line.split(" | ") for line in bench.tabulate_beliefs(rows).splitlines()]
     calibrated, filtered = (line[2:] for line in table if line[0] == "| all")
     assert calibrated[:4] == ["1", *["0 / 100 / 100 / 100"] * 2, "100 / 0"]
-    assert calibrated[4:] == ["2.0 mm, 2.9", "100", "3.0 |"]
+    assert calibrated[4:7] == ["2.0 mm, 2.9", "100", "3.0"]
     assert filtered[:3] == ["1", *["0 / 0 / 0 / 0"] * 2]
     assert len(bench.tabulate_beliefs(rows[1:]).splitlines()) == 2  # none is right
 

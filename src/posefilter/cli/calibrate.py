@@ -20,6 +20,7 @@ from posefilter.cli.files import save_whole
 from posefilter.cli.job import Job
 from posefilter.cli.machine import settle
 from posefilter.confidence.belief_scale import (
+    FEWEST_RIGHT,
     BeliefScale,
     PoseSpread,
     calibrate_belief,
@@ -258,6 +259,9 @@ def tell(job: Job, method: PoseEstimator, calibration: Calibration, out: Path) -
     if calibration.conformal is not None:
         shown = " and ".join(str(len(own)) for own in calibration.conformal.scores)
         rows.append(("groups of those with it, by rising probability", shown))
+    few = f"that of the particles: fewer than {FEWEST_RIGHT} estimates are right"
+    width = f"learned from {counts['right']} right estimates"
+    rows.append(("width of a belief", few if calibration.belief_scale is None else width))
     infos = {key: find_metric(f"confidence/{key}") for key in _SHOWN if key in quality}
     rows += [(info.label, info.describe(quality[key])) for key, info in infos.items()]
     title = f"{method.object_model.name}: held-out parts of the calibration frames"
