@@ -1,6 +1,7 @@
 """A calibrated belief is as wide as the errors of right estimates, however wide the filter's is."""
 
 import math
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -22,6 +23,7 @@ from posefilter.errors import UserError
 from posefilter.geometry.pose import make_pose, move_about
 from posefilter.geometry.rotation import exp_so3, random_rotation
 from posefilter.metrics.credibility import score_truth
+from posefilter.models.base import PoseEstimator
 from posefilter.types import BeliefBatch, ObjectModel
 
 CENTER = torch.tensor([0.01, -0.02, 0.03], dtype=torch.float64)
@@ -221,6 +223,22 @@ def calibration(belief_scale: BeliefScale | None) -> Calibration:
     return Calibration(
         ("score",), (0.0,), (1.0,), one, one, counts, "fat", {}, belief_scale=belief_scale
     )
+
+
+def test_the_factor_goes_by_the_default_tolerance_whatever_the_verdict_goes_by() -> None:
+    (beliefs, _), _ = simulate(2, 1.0, slope=0)
+    own = calibration(BeliefScale(-0.5, -0.3))
+    found = own.assess({"score": torch.tensor([1.0, -1.0])})
+    method = SimpleNamespace(calibration=own, object_model=model())
+    elsewhere = found._replace(probability=torch.zeros(2))  # of a stricter tolerance
+    out = PoseEstimator.calibrate_belief(method, beliefs, elsewhere)  # type: ignore[arg-type]
+    wanted = calibrate_belief(beliefs, found.probability, BeliefScale(-0.5, -0.3), model())
+    assert torch.equal(out.poses, wanted.poses)
+    assert not torch.equal(out.poses[0], beliefs.poses[0])
+    for plain, known in ((calibration(None), found), (own, None)):
+        method = SimpleNamespace(calibration=plain, object_model=model())
+        same = PoseEstimator.calibrate_belief(method, beliefs, known)  # type: ignore[arg-type]
+        assert same is beliefs
 
 
 def test_a_scale_is_stored_and_read_and_older_calibrations_have_none() -> None:

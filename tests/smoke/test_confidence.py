@@ -287,14 +287,18 @@ def test_a_belief_is_as_wide_as_the_calibration_says_in_results_files_and_metric
             assert f"{said}: within " in capfd.readouterr().out
         assert ("not calibrated" in told["belief"]["belief_is"]) == (file == calibrated)
 
-    coverage = []
+    coverage, spread = [], []
     for file in there:
         out = tmp_path / f"test_of_{file.stem}"
         typed = [f"checkpoint={file}", f"data.root={tiny_scenes}", *QUIET, f"out={out}"]
         typed += ["data.split={train: 0, val: 0, test: 1.0}"]
         assert run_command("evaluate", HOME, typed) == 0
         coverage.append(json.loads((out / "metrics.json").read_text())["belief"])
+        with np.load(out / "beliefs.npz") as found:
+            assert found["weights"].shape[1] == 200  # filters have 16
+            spread.append(float(found["poses"][:, :, :3, 3].std(1).mean()))
     assert coverage[0] != coverage[1]
+    assert spread[0] < spread[1]
 
 
 def test_an_evaluation_reports_how_much_the_probability_tells(

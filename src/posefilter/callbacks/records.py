@@ -51,7 +51,10 @@ class Records(TraceCallback):
         times = method.seconds_per_image
         seconds = times[-1] if times else math.nan
         probabilities = method.last_assessment(len(batch.rgb)).probability.tolist()
-        self.outcomes += collect_outcomes(trace, batch, seconds, probabilities)
+        # as the metrics and results have it
+        belief = method.calibrate_belief(trace.belief, method.assess(trace, batch))
+        calibrated = trace._replace(belief=belief)
+        self.outcomes += collect_outcomes(calibrated, batch, seconds, probabilities)
 
 
 def collect_outcomes(
