@@ -39,7 +39,6 @@ import numpy as np
 import torch
 from checkpoint_frames import open_frames
 from confidence import measure_error, read_tolerance
-
 from scipy.stats import kstest
 
 from posefilter.belief import Belief
