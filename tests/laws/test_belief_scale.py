@@ -12,6 +12,7 @@ from posefilter import Belief
 from posefilter.cli.calibrate import Beliefs, fit_beliefs
 from posefilter.confidence.belief_scale import (
     BeliefScale,
+    PoseSpread,
     calibrate_belief,
     draw_student_t,
     fit_belief_scale,
@@ -116,6 +117,20 @@ def test_a_fit_takes_right_estimates_alone_and_few_of_them_give_none() -> None:
     assert plain == pytest.approx(own)
 
 
+def test_no_frame_is_judged_by_a_scale_that_has_seen_it() -> None:
+    (beliefs, truth), probability = simulate(25, 1.0, slope=-0.2)
+    other = truth.clone()
+    other[0, 0, 3] += 0.02
+    all_right = np.ones(25, bool)
+    a, b = (
+        fit_beliefs(Beliefs(beliefs, one), probability, all_right, model())[1]
+        for one in (truth, other)
+    )
+    # the four others of the frame's own part are calibrated by the same fit as before
+    assert int((a == b).sum()) == 4
+    assert a[0] != b[0]
+
+
 def test_draws_have_the_moments_of_the_distribution_and_are_always_the_same() -> None:
     for count in (32, 200, 201):
         draws = draw_student_t(count)
@@ -209,6 +224,32 @@ def test_where_an_estimate_is_not_finite_the_particles_stay() -> None:
     scale, surprise = fit_beliefs(Beliefs(given, truth), probability, right, model())
     assert scale is not None
     assert np.isfinite(surprise).all()
+
+
+def test_the_scatter_is_about_the_estimate_and_has_full_rank() -> None:
+    (beliefs, truth), _ = simulate(1, 1.0, slope=0)
+    twist = torch.zeros(3, 6, dtype=torch.float64)
+    twist[0, 0], twist[1, 4], twist[2, 2] = 0.01, 0.02, 1.0  # the last is another hypothesis
+    weights = torch.tensor([[0.6, 0.2, 0.2]], dtype=torch.float64)
+    poses = move(beliefs.best[:, None], twist)
+    found = measure_spread(
+        beliefs._replace(poses=poses, log_weights=weights.log()), truth, model()
+    ).scatter[0]
+    count = 0.8**2 / (0.6**2 + 0.2**2)  # effective
+    moment = torch.diag(torch.tensor([0.75 * 0.01**2, 0, 0, 0, 0.25 * 0.02**2, 0]).double())
+    prior = (0.03 * DIAMETER) ** 2 * torch.eye(6, dtype=torch.float64)
+    assert torch.allclose(found, (count * moment + 4 * prior) / (count + 4), atol=1e-12, rtol=1e-6)
+
+
+def test_ten_frames_do_not_take_a_fit_far_from_what_is_known_of_other_objects() -> None:
+    spread = PoseSpread(
+        torch.zeros(10, 6, dtype=torch.float64), torch.eye(6, dtype=torch.float64).expand(10, 6, 6)
+    )
+    found = fit_belief_scale(spread, torch.full((10,), 0.5))
+    assert found is not None
+    # minus log posterior: 60 bias + ((bias + 0.2) / 0.5)^2 / 2, and of the slope its prior alone
+    assert found.bias == pytest.approx(-0.2 - 60 * 0.5**2, abs=1e-3)
+    assert found.slope == pytest.approx(-0.2, abs=1e-3)
 
 
 def test_the_factor_is_limited_to_what_frames_can_tell() -> None:
