@@ -150,7 +150,7 @@ def look(method: PoseEstimator, found: Observation, there: bool) -> Iterator[Row
     object_model, calibration = method.object_model, method.calibration
     assert calibration is not None
     said = calibration.assess(found.features)
-    belief = method.calibrate_belief(found.belief, said)
+    belief, draws = method.calibrate_belief(found.belief, said)
     errors, seen = None, []
     if there:
         errors = measure_pose_errors(belief.best, found.truth, object_model)
@@ -175,7 +175,7 @@ def look(method: PoseEstimator, found: Observation, there: bool) -> Iterator[Row
             row["held"] = [nonconformity <= sets.find_limit(level / 100, value) for level in SHOWN]
             truth, K = (x[i].double().numpy() for x in (found.truth, found.intrinsics))
             for which, scores, of in (("", calibrated, belief), ("plain_", plain, found.belief)):
-                own = open_belief(of, i, object_model)
+                own = open_belief(of, i, object_model, draws if of is belief else None)
                 row[f"{which}rank"] = float(scores.rank[i])
                 row[f"{which}log_density"] = float(scores.log_density[i])
                 estimate = of.best[i].double().numpy()
@@ -185,12 +185,15 @@ def look(method: PoseEstimator, found: Observation, there: bool) -> Iterator[Row
         yield row
 
 
-def open_belief(beliefs: BeliefBatch, i: int, object_model: ObjectModel) -> Belief:
+def open_belief(
+    beliefs: BeliefBatch, i: int, object_model: ObjectModel, draws: torch.Tensor | None
+) -> Belief:
     """Return one belief of a batch as users get it."""
     weights = beliefs.log_weights[i].double().softmax(0).numpy()
     sizes = (float(object_model.radius), float(object_model.diameter), object_model.name)
     center, group = (x.double().numpy() for x in (object_model.center, object_model.symmetries))
-    return Belief(beliefs.poses[i].double().numpy(), weights, center, *sizes, group)
+    own = 0 if draws is None else int(draws[i])
+    return Belief(beliefs.poses[i].double().numpy(), weights, center, *sizes, group, own)
 
 
 def collect(file: str, options: Any, end: float) -> bool:

@@ -111,7 +111,8 @@ def measure_error(belief: Belief, estimate: np.ndarray, truth: np.ndarray) -> di
         ellipsoid that holds the truth, of the covariance about the estimate and in the shape of
         Student's t with 5 degrees of freedom.
     """
-    near = replace(belief, samples=truth[None], weights=np.ones(1)).canonicalize(estimate)
+    lone = replace(belief, samples=truth[None], weights=np.ones(1), draws=0)
+    near = lone.canonicalize(estimate)
     about = torch.from_numpy(estimate)
     twist = twist_between(about, torch.from_numpy(near.samples[0]), torch.from_numpy(belief.center))
     error, spread = twist.numpy(), belief.covariance_about(estimate)

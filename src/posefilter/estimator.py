@@ -188,12 +188,11 @@ class Estimator:
                 trace = method.predict_step(batch, 0)
                 found = method.assess(trace, batch)
                 apparent = method.measure_apparent_size(trace, batch)
-                belief = method.calibrate_belief(trace.belief, found)
-            calibrated = belief is not trace.belief
+                belief, draws = method.calibrate_belief(trace.belief, found)
             trace = trace._replace(belief=belief)
             trace.belief.best.cpu()  # waits for a GPU
             seconds = (time.perf_counter() - start) / len(images.depth)
-            runs.append(Run(method, batch, trace, seconds, found, apparent, blank, calibrated))
+            runs.append(Run(method, batch, trace, seconds, found, apparent, blank, draws))
         return runs
 
 

@@ -306,7 +306,8 @@ class Run(NamedTuple):
     found: Assessment | None = None  # None where there is no probability
     size: ApparentSize | None = None  # None where the method cannot tell
     blank: Sequence[str] = ()  # of each image, as `find_blank` says it; none: all can be judged
-    calibrated: bool = False  # whether the trace's belief is, see `PoseEstimator.calibrate_belief`
+    # (B,) how many of the belief's first poses are draws about the estimate, None: not calibrated
+    draws: torch.Tensor | None = None
 
 
 def collect_results(
@@ -358,6 +359,7 @@ def make_result(
             float(object_model.diameter),
             object_model.name,
             object_model.symmetries.detach().cpu().double().numpy(),
+            0 if run.draws is None else int(run.draws[image]),
         ),
         warnings=(blank, *warnings) if blank else warnings,
         seconds=run.seconds,
@@ -372,7 +374,7 @@ def make_result(
         apparent_size=size,
         wrong_size=wrong_size,
         blank=blank,
-        belief_calibrated=run.calibrated,
+        belief_calibrated=run.draws is not None,
     )
 
 

@@ -1,6 +1,8 @@
 """A calibrated belief is as wide as the errors of right estimates, however wide the filter's is."""
 
 import math
+from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -82,7 +84,7 @@ def test_sets_and_ellipsoids_of_new_frames_hold_the_truth_as_often_as_they_say(
     assert scale is not None
     (new, new_truth), said = simulate(150, too_wide, slope=-0.2, seed=7)
     before = score_truth(new, new_truth, model())
-    after_belief = calibrate_belief(new, said, scale, model())
+    after_belief, _ = calibrate_belief(new, said, scale, model())
     after = score_truth(after_belief, new_truth, model())
     assert float(after.log_density.mean()) > float(before.log_density.mean()) + 1
     error = math.sqrt(0.25 / 150)
@@ -149,7 +151,7 @@ def test_draws_have_the_moments_of_the_distribution_and_are_always_the_same() ->
 def test_the_covariance_about_the_estimate_is_that_of_the_model() -> None:
     (beliefs, truth), probability = simulate(3, 2.0, slope=0)
     scale = BeliefScale(bias=-0.5, slope=-0.1)
-    out = calibrate_belief(beliefs, probability, scale, model())
+    out, _ = calibrate_belief(beliefs, probability, scale, model())
     assert torch.equal(out.best, beliefs.best)
     assert torch.equal(out.score, beliefs.score)
     scatter = measure_spread(beliefs, truth, model()).scatter
@@ -171,7 +173,7 @@ def test_hypotheses_elsewhere_keep_their_poses_and_their_mass() -> None:
     poses[0, :60] = poses[0, :60] @ half_turn
     log_weights[0, :60] = math.log(2)
     given = beliefs._replace(poses=poses, log_weights=log_weights.log_softmax(1))
-    out = calibrate_belief(given, probability, BeliefScale(0.0, 0.0), model())
+    out, _ = calibrate_belief(given, probability, BeliefScale(0.0, 0.0), model())
     weights = out.log_weights[0].exp()
     kept = (out.poses[0, :, None] - poses[0, None, :60]).abs().amax((2, 3)).amin(1) < 1e-12
     mass = 120 / 260
@@ -183,7 +185,7 @@ def test_hypotheses_elsewhere_keep_their_poses_and_their_mass() -> None:
     group = torch.stack([torch.eye(4, dtype=torch.float64), half_turn])
     group[1, :3, 3] = CENTER - half_turn[:3, :3] @ CENTER
     poses[0, :60] = beliefs.poses[0, :60] @ group[1]
-    same = calibrate_belief(
+    same, _ = calibrate_belief(
         given._replace(poses=poses), probability, BeliefScale(0, 0), model(group)
     )
     centers = same.poses[0, :, :3, :3] @ CENTER + same.poses[0, :, :3, 3]
@@ -192,13 +194,26 @@ def test_hypotheses_elsewhere_keep_their_poses_and_their_mass() -> None:
     assert float((centers - centers.mean(0)).norm(dim=1).median()) < 0.02
 
 
+def test_of_a_continuous_symmetry_any_turn_is_as_dense() -> None:
+    (beliefs, _), probability = simulate(4, 1.0, slope=0)
+    angle = torch.arange(36, dtype=torch.float64)[:, None] * math.radians(10)
+    rotation = exp_so3(angle * torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64))
+    bowl = model(make_pose(rotation, CENTER - rotation @ CENTER))
+    out, _ = calibrate_belief(beliefs, probability, BeliefScale(0.0, 0.0), bowl)
+    half = exp_so3(torch.tensor([0.0, 0.0, math.radians(5)], dtype=torch.float64))
+    between = beliefs.best @ make_pose(half, CENTER - half @ CENTER)
+    at, beside = (score_truth(out, one, bowl) for one in (beliefs.best, between))
+    assert float((at.log_density - beside.log_density).abs().max()) < 1
+    assert float(beside.rank.max()) < 0.5
+
+
 def test_one_particle_and_none_near_the_estimate_become_a_belief_about_it() -> None:
     best = torch.eye(4)[None]
     for shift in (0.0, 1.0):
         poses = best[:, None].clone()
         poses[0, 0, 2, 3] += shift
         lone = BeliefBatch(poses, torch.zeros(1, 1), best, torch.zeros(1))
-        out = calibrate_belief(lone, torch.ones(1), BeliefScale(0.0, 0.0), model())
+        out, _ = calibrate_belief(lone, torch.ones(1), BeliefScale(0.0, 0.0), model())
         assert out.poses.shape == (1, 200, 4, 4)
         assert out.poses.dtype == torch.float32
         weights = out.log_weights[0].exp()
@@ -215,7 +230,7 @@ def test_where_an_estimate_is_not_finite_the_particles_stay() -> None:
     log_weights = torch.full((12, 200), -1e9, dtype=torch.float64)
     log_weights[:, 3], log_weights[:, 7] = math.log(0.25), math.log(0.75)
     given = beliefs._replace(best=best, log_weights=log_weights)
-    out = calibrate_belief(given, probability, BeliefScale(0.0, 0.0), model())
+    out, _ = calibrate_belief(given, probability, BeliefScale(0.0, 0.0), model())
     assert torch.equal(out.poses[1, :50], beliefs.poses[1, [3]].expand(50, 4, 4))
     assert torch.equal(out.poses[1, 50:], beliefs.poses[1, [7]].expand(150, 4, 4))
     assert float(out.log_weights.exp().sum(1).sub(1).abs().max()) < 1e-9
@@ -272,13 +287,13 @@ def test_the_factor_goes_by_the_default_tolerance_whatever_the_verdict_goes_by()
     found = own.assess({"score": torch.tensor([1.0, -1.0])})
     method = SimpleNamespace(calibration=own, object_model=model())
     elsewhere = found._replace(probability=torch.zeros(2))  # of a stricter tolerance
-    out = PoseEstimator.calibrate_belief(method, beliefs, elsewhere)  # type: ignore[arg-type]
-    wanted = calibrate_belief(beliefs, found.probability, BeliefScale(-0.5, -0.3), model())
+    out, _ = PoseEstimator.calibrate_belief(method, beliefs, elsewhere)  # type: ignore[arg-type]
+    wanted, _ = calibrate_belief(beliefs, found.probability, BeliefScale(-0.5, -0.3), model())
     assert torch.equal(out.poses, wanted.poses)
     assert not torch.equal(out.poses[0], beliefs.poses[0])
     for plain, known in ((calibration(None), found), (own, None)):
         method = SimpleNamespace(calibration=plain, object_model=model())
-        same = PoseEstimator.calibrate_belief(method, beliefs, known)  # type: ignore[arg-type]
+        same, _ = PoseEstimator.calibrate_belief(method, beliefs, known)  # type: ignore[arg-type]
         assert same is beliefs
 
 
@@ -307,3 +322,57 @@ def test_a_scale_that_is_none_is_refused(content: object) -> None:
     plain = calibration(None).to_plain() | {"belief_scale": content}
     with pytest.raises(UserError, match=r"x: its calibration .*belief_scale"):
         read_calibration(plain, "x")
+
+
+def open_belief(beliefs: BeliefBatch, draws: Tensor) -> Belief:
+    weights = beliefs.log_weights[0].exp().numpy()
+    own = (CENTER.numpy(), RADIUS, DIAMETER, "thing", np.eye(4)[None], int(draws[0]))
+    return Belief(beliefs.poses[0].numpy(), weights, *own)
+
+
+def test_draws_are_one_mode_however_wide_and_the_uncertainty_is_of_the_estimate() -> None:
+    (beliefs, _), probability = simulate(1, 1.0, slope=0)
+    wide, draws = calibrate_belief(beliefs, probability, BeliefScale(1.5, 0.0), model())
+    belief = open_belief(wide, draws)
+    assert belief.draws == 200
+    assert len(belief.modes) == 1
+    assert belief.modes[0].pose == pytest.approx(beliefs.best[0].numpy(), abs=1e-3)
+    off = np.linalg.norm((belief.samples - belief.modes[0].pose) @ [*CENTER, 1], axis=1)
+    assert belief.uncertainty().translation == pytest.approx(np.quantile(off, 0.95), rel=0.05)
+    assert belief.uncertainty().mass == pytest.approx(1)
+    as_particles = replace(belief, draws=0)
+    assert len(as_particles.modes) > 5  # what quick shift would make of them
+
+    # most of the particles are elsewhere: another hypothesis is heavier, and no more certain
+    poses = beliefs.poses.clone()
+    poses[0, 30:, 0, 3] += 0.3
+    away, draws = calibrate_belief(
+        beliefs._replace(poses=poses), probability, BeliefScale(0.0, 0.0), model()
+    )
+    belief = open_belief(away, draws)
+    assert belief.draws == 32
+    assert belief.modes[0].mass > 0.7
+    assert abs(belief.modes[0].pose[0, 3] - poses[0, 30:, 0, 3].mean()) < 0.02
+    near = (
+        belief.modes[1]
+        if len(belief.modes) == 2
+        else max(belief.modes[1:], key=lambda mode: mode.mass)
+    )
+    assert near.pose == pytest.approx(beliefs.best[0].numpy(), abs=2e-3)
+    assert belief.uncertainty().mass == pytest.approx(near.mass)
+    assert "of a pose that has 16 % of the belief" in belief.uncertainty().describe()
+    assert sum(mode.mass for mode in belief.modes) == pytest.approx(1)
+
+
+def test_draws_survive_a_file_and_another_frame_and_are_none_of_a_fused_belief(
+    tmp_path: Path,
+) -> None:
+    (beliefs, _), probability = simulate(1, 1.0, slope=0)
+    belief = open_belief(*calibrate_belief(beliefs, probability, BeliefScale(0, 0), model()))
+    belief.save(tmp_path / "belief.npz")
+    assert Belief.load(tmp_path / "belief.npz").draws == 200
+    assert belief.transform(np.eye(4)).draws == 200
+    assert belief.fuse(belief, 50).draws == 0
+    for wrong in (-1, 201):
+        with pytest.raises(UserError, match="cannot be draws"):
+            replace(belief, draws=wrong)

@@ -57,6 +57,8 @@ class Belief:
         object: The object's name.
         symmetries: Its symmetries (S, 4, 4) object_from_object, a group, the identity first. Poses
             that they make of one another are equivalent, and share the density equally.
+        draws: So many of the first samples are draws about the estimate, which are one mode however
+            far apart: a calibrated belief's.
     """
 
     samples: np.ndarray
@@ -66,6 +68,7 @@ class Belief:
     diameter: float
     object: str = ""
     symmetries: np.ndarray = field(default_factory=lambda: np.eye(4)[None])
+    draws: int = 0
 
     def __post_init__(self) -> None:
         """Bring arrays to float64 and weights to a sum of 1, and check all.
@@ -98,6 +101,8 @@ class Belief:
             raise UserError("belief: the symmetries should be rigid transforms")
         if self.center.shape != (3,) or not np.isfinite(self.center).all():
             raise UserError(f"belief: the center should be three numbers, not {self.center}")
+        if not 0 <= self.draws <= count:
+            raise UserError(f"belief: {self.draws} of its {count} samples cannot be draws")
         for name in ("radius", "diameter"):
             if not 0 < getattr(self, name) < np.inf:
                 raise UserError(
@@ -172,6 +177,7 @@ class Belief:
 
         Found by quick shift (Vedaldi & Soatto 2008): two particles belong to one mode where a chain
         of ever denser neighbors, each within a tenth of the diameter, leads from one to the other.
+        The draws of a calibrated belief are one mode, with their mean as its pose.
         """
         samples, weights = self._tensors
         center, found = torch.from_numpy(self.center), self._found
@@ -285,7 +291,8 @@ class Belief:
 
     def uncertainty(self, level: float = 0.95) -> Uncertainty:
         """Return how far particles are from the mean of the heaviest mode, those of its own and of
-        equivalent modes; `describe()` of it says so in words.
+        equivalent modes; `describe()` of it says so in words.  Of a calibrated belief it is the
+        estimate's mode, also where it is not the heaviest.
 
         Equivalent poses are one: of each particle the nearest to that mean counts, and a continuous
         symmetry has no gaps between its turns.
@@ -294,9 +301,12 @@ class Belief:
             UserError: The level is not in [0, 1].
         """
         samples, weights = self._tensors
-        heaviest, center = self._found.member == 0, torch.from_numpy(self.center)
+        center = torch.from_numpy(self.center)
+        own = heaviest = torch.arange(len(weights)) < self.draws
+        if not self.draws:
+            heaviest = self._found.member == 0
+            own = torch.isin(self._found.member, torch.tensor(self._list_alike()))
         pose = self._mean(samples[heaviest], weights[heaviest] / weights[heaviest].sum())
-        own = torch.isin(self._found.member, torch.tensor(self._list_alike()))
         poses, share = samples[own], weights[own] / weights[own].sum()
         mass, group = float(weights[own].sum()), densify(torch.from_numpy(self.symmetries))
         return measure_uncertainty(poses, share, pose, mass, center, group, level)
@@ -365,7 +375,7 @@ class Belief:
         """Return the belief after two views of one object that rests: the product of both.
 
         By Bayes' rule with a flat prior, if the views err independently.  Views of one filter from
-        like directions do not, and its beliefs are too sure: the result is surer than it should be.
+        like directions do not: the result is surer than it should be.
         Of views that contradict each other both are kept, as modes.  The densities' kernels make
         standard deviations of Gaussians a tenth to a half too large.
 
@@ -395,7 +405,7 @@ class Belief:
         p, q = self.log_density(samples), other.log_density(samples)
         log_weights = torch.from_numpy(p + q - np.logaddexp(p, q))
         weights = log_weights.softmax(0).numpy()
-        fused = replace(self, samples=samples, weights=weights)
+        fused = replace(self, samples=samples, weights=weights, draws=0)
         return fused.canonicalize(samples[weights.argmax()])
 
     def save(self, path: str | Path) -> None:
@@ -440,7 +450,20 @@ class Belief:
     @cached_property
     def _found(self) -> Modes:
         samples, weights = self._tensors
-        return find_pose_modes(samples, weights.log(), self._space, self.diameter)
+        draws, others = self.draws, weights[self.draws :]
+        if not draws:
+            return find_pose_modes(samples, weights.log(), self._space, self.diameter)
+        mass = weights[:draws].sum()
+        states = self._mean(samples[:draws], weights[:draws] / mass)[None]
+        masses, member = mass[None], torch.zeros(len(weights), dtype=torch.int64)
+        if float(others.sum()) > 0:
+            share = (others / others.sum()).log()
+            found = find_pose_modes(samples[draws:], share, self._space, self.diameter)
+            states = torch.cat([states, found.states])
+            masses = torch.cat([masses, found.weights * others.sum()])
+            member[draws:] = 1 + found.member
+        order = masses.argsort(descending=True, stable=True)
+        return Modes(states[order], masses[order], order.argsort()[member])
 
     def _is_equivalent(self, found: Modes, heavier: int, pose: Tensor) -> bool:
         copies = found.states[heavier] @ torch.from_numpy(self.symmetries)

@@ -63,6 +63,7 @@ def read_arrays(path: str | Path) -> dict[str, Any]:
             "object": str(read["object"]),
             # of later files alone
             "symmetries": np.array(read.get("symmetries", np.eye(4)[None]), dtype=np.float64),
+            "draws": int(read.get("draws", 0)),
         }
     except UserError:
         raise

@@ -52,7 +52,7 @@ class Records(TraceCallback):
         seconds = times[-1] if times else math.nan
         probabilities = method.last_assessment(len(batch.rgb)).probability.tolist()
         # as the metrics and results have it
-        belief = method.calibrate_belief(trace.belief, method.assess(trace, batch))
+        belief, _ = method.calibrate_belief(trace.belief, method.assess(trace, batch))
         calibrated = trace._replace(belief=belief)
         self.outcomes += collect_outcomes(calibrated, batch, seconds, probabilities)
 

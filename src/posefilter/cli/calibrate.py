@@ -233,7 +233,7 @@ def fit_beliefs(
         own, truth = beliefs.select(held)
         scale = None if whole is None else fit(np.flatnonzero(fold != k)) or whole
         if scale is not None:
-            own = calibrate_belief(own, probability[held], scale, object_model)
+            own, _ = calibrate_belief(own, probability[held], scale, object_model)
         nonconformity[held] = score_truth(own, truth, object_model).nonconformity.numpy()
     return whole, nonconformity
 

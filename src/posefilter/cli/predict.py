@@ -95,7 +95,7 @@ def predict_one(job: Job) -> list[Result]:
     write_json(folder / "pose.json", answer)
     if cfg.save_rerun:
         model, space = method.object_model, method.space
-        known = run.calibrated
+        known = run.draws is not None
         view = collect_view_data(run.trace, run.batch, model, space, shape, calibrated=known)
         record(view, folder / VIEW)
     if cfg.console != JSON:

@@ -113,7 +113,7 @@ def fit_belief_scale(spread: PoseSpread, probability: Tensor) -> BeliefScale | N
 
 def calibrate_belief(
     belief: BeliefBatch, probability: Tensor, scale: BeliefScale, object_model: ObjectModel
-) -> BeliefBatch:
+) -> tuple[BeliefBatch, Tensor]:
     """Return beliefs that are as wide as the errors of right estimates are.
 
     Args:
@@ -125,28 +125,33 @@ def calibrate_belief(
     Returns:
         B beliefs of as many particles, 200 at least, with the same estimates and scores.  The
         draws are always the same ones, moved, so that the same input has the same belief.  Where an
-        estimate is not finite they are the particles alone.
+        estimate is not finite they are the particles alone.  And of each, how many of the first
+        poses are draws about the estimate, (B,) int64.
     """
     factors = scale.find_factor(probability.detach().cpu())
     count = max(belief.log_weights.shape[1], _FEWEST_PARTICLES)
     rows = [
         _redraw(belief, i, float(factor), count, object_model) for i, factor in enumerate(factors)
     ]
-    poses, log_weights = (torch.stack(part) for part in zip(*rows, strict=True))
-    return belief._replace(
-        poses=poses.to(belief.poses), log_weights=log_weights.to(belief.log_weights)
+    poses, log_weights, draws = zip(*rows, strict=True)
+    whole = belief._replace(
+        poses=torch.stack(poses).to(belief.poses),
+        log_weights=torch.stack(log_weights).to(belief.log_weights),
     )
+    return whole, torch.tensor(draws)
 
 
 def _redraw(
     belief: BeliefBatch, i: int, factor: float, count: int, object_model: ObjectModel
-) -> tuple[Tensor, Tensor]:
-    """Return the poses (count, 4, 4) and log weights (count,) of one calibrated belief, float64."""
+) -> tuple[Tensor, Tensor, int]:
+    """Return the poses (count, 4, 4) and log weights (count,) of one calibrated belief, float64,
+    and how many of the first are draws.
+    """
     best, poses = (x[i].detach().cpu().double() for x in (belief.best, belief.poses))
     weights = belief.log_weights[i].detach().cpu().double().softmax(0)
     if not bool(best.isfinite().all()):  # no estimate: the particles are all that is known
         even = torch.full((count,), -math.log(count), dtype=torch.float64)
-        return _resample(poses, weights, count), even
+        return _resample(poses, weights, count), even, 0
     scatter, near = _measure_scatter(belief, i, object_model)
     mass = float(weights[near].sum())
     own = max(round(count * mass), _FEWEST_DRAWS)
@@ -154,12 +159,27 @@ def _redraw(
     if own == _FEWEST_DRAWS or not rest:  # few particles are near the estimate, or all are
         mass = max(mass, own / count)
     twist = factor * draw_student_t(own) @ torch.linalg.cholesky(scatter).mT / _unit(object_model)
-    drawn = move_about(best, twist, object_model.center.detach().cpu().double())
+    drawn = _turn_between(
+        move_about(best, twist, object_model.center.detach().cpu().double()), object_model
+    )
     log_weights = torch.full((count,), math.log(mass / own), dtype=torch.float64)
     if rest:
         log_weights[own:] = math.log((1 - mass) / rest)
         drawn = torch.cat([drawn, _resample(poses, weights.masked_fill(near, 0), rest)])
-    return drawn, log_weights
+    return drawn, log_weights, own
+
+
+def _turn_between(poses: Tensor, object_model: ObjectModel) -> Tensor:
+    """Return poses (N, 4, 4), of an object with a continuous symmetry turned about its axis by up
+    to the least of its turns.
+
+    A density knows such an object by few turns, and poses about one alone would leave gaps between
+    them.
+    """
+    group = object_model.symmetries.detach().cpu().double()
+    between = densify(group)[:: len(group)]  # the turns from one to the next
+    # the same for both of a pair
+    return poses @ between[torch.arange(len(poses)) // 2 % len(between)]
 
 
 def _resample(poses: Tensor, weights: Tensor, count: int) -> Tensor:

@@ -282,16 +282,22 @@ class PoseEstimator(Module):
         features = self.collect_features(trace, batch)
         return self.calibration.assess(features, self.pose_tolerance)
 
-    def calibrate_belief(self, belief: BeliefBatch, found: Assessment | None) -> BeliefBatch:
+    def calibrate_belief(
+        self, belief: BeliefBatch, found: Assessment | None
+    ) -> tuple[BeliefBatch, Tensor | None]:
         """Return beliefs as wide as the errors of right estimates are (confidence/belief_scale.py).
 
         Args:
             belief: B beliefs, as the filter leaves them.
             found: What `assess` says of them; where it is None, or the calibration knows no scale,
                 beliefs are returned as they are.
+
+        Returns:
+            The beliefs; and of each, how many of the first poses are draws about the estimate,
+            (B,), None where they are as they were.
         """
         if found is None or self.calibration is None or self.calibration.belief_scale is None:
-            return belief
+            return belief, None
         assert found.features is not None
         right = self.calibration.assess(found.features).probability  # within the default tolerance
         return calibrate_belief(belief, right, self.calibration.belief_scale, self.object_model)
@@ -442,7 +448,7 @@ class PoseEstimator(Module):
             self.scores["bop"].update(best, true_pose, batch.intrinsics, width)
             self.scores["by_visibility"].collect(best, true_pose, batch.visibility)
             found = self.judge_confidence(trace, batch, present=True)
-            belief = self.calibrate_belief(trace.belief, found)
+            belief, _ = self.calibrate_belief(trace.belief, found)
             self.scores["belief"].update(belief, true_pose)
             seen = score_truth(belief, true_pose, self.object_model)
             self.scores["credibility"].update(seen, batch.visibility)
