@@ -124,9 +124,10 @@ def _describe_credible() -> tuple[MetricInfo, ...]:
             f"credibility/coverage_{level}",
             f"coverage of the {level} % credible set",
             ".0f",
-            HIGHER if level == 90 else NEITHER,  # filters are overconfident; see diagnostics
+            HIGHER if level == 90 else NEITHER,  # most are too low; see diagnostics
             f"{level} % credible set",
-            f"truths in the highest-density set: {level} where calibrated; fewer: overconfident",
+            f"truths in the highest-density set: {level} where calibrated; fewer: wrong or too "
+            "narrow",
         )
         for level in (50, 80, 90, 95)
     )
@@ -141,7 +142,7 @@ def _describe_regions() -> tuple[MetricInfo, ...]:
             HIGHER if level == 90 else NEITHER,
             f"{level} % distance region",
             f"truths whose mean distance to the particles is within the belief's {level} % "
-            f"quantile: {level} where calibrated; fewer: overconfident",
+            f"quantile: {level} where calibrated; fewer: wrong, or too narrow",
         )
         for level in (50, 90)
     )

@@ -18,7 +18,7 @@ def show_calibration(metrics: Mapping[str, Any]) -> list[Block]:
     panels = [*chart_coverage(metrics), *chart_reliability(metrics)]
     if not panels:
         return []
-    text = "On the diagonal, the belief is calibrated; below it, overconfident."
+    text = "On the diagonal, beliefs are calibrated; below it, wrong or too narrow."
     words: list[Block] = [Heading("Calibration"), Paragraph([text])]
     return [*words, *draw_charts(panels), *list_coverage(metrics), *list_reliability(metrics)]
 

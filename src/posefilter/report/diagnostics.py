@@ -44,9 +44,11 @@ DIAGNOSTICS = (
         0.02,
         "The likelihood prefers a wrong pose: no amount of searching would help.",
     ),
-    Diagnostic("belief/distance_coverage_90", 75.0, "The belief is overconfident."),
+    Diagnostic("belief/distance_coverage_90", 75.0, "Estimates are wrong, or beliefs too narrow."),
     Diagnostic(
-        "credibility/coverage_90", 80.0, "Credible sets are too small: the belief is overconfident."
+        "credibility/coverage_90",
+        80.0,
+        "Credible sets miss the truth: estimates are wrong, or beliefs too narrow.",
     ),
     Diagnostic("diagnostics/pairwise_cosine", 0.8, "All particles move in one direction."),
     Diagnostic("diagnostics/offset_r2", 0.1, "Displacements say no more than their mean would."),
