@@ -49,13 +49,15 @@ from posefilter.data.absent import hide_annotation
 from posefilter.data.loaders import make_loader
 from posefilter.figures.band import find_band, measure_cover
 from posefilter.figures.canvas import View
+from posefilter.files import open_whole
 from posefilter.geometry.camera import project
 from posefilter.geometry.pose import transform
 from posefilter.metrics.confidence import calibration_error, error_at_coverage
 from posefilter.metrics.credibility import SHOWN, score_truth
 from posefilter.metrics.diagnostics import auroc
 from posefilter.models.base import PoseEstimator
-from posefilter.types import Batch, BeliefBatch, ObjectModel
+from posefilter.result import make_belief
+from posefilter.types import Batch, BeliefBatch
 
 QUARTERS = (0.0, 0.25, 0.5, 0.75)
 LEVEL = 0.95  # of the band
@@ -93,9 +95,8 @@ def save_observation(found: Observation, file: Path) -> None:
     arrays |= {f"feature.{key}": part.numpy() for key, part in found.features.items()}
     arrays |= {"truth": found.truth.numpy(), "intrinsics": found.intrinsics.numpy()}
     arrays |= {"visibility": found.visibility.numpy(), "size": np.array(found.size)}
-    part = file.with_suffix(".part.npz")
-    np.savez(part, **arrays, scenes=np.array(found.scenes))
-    part.replace(file)
+    with open_whole(file, sync=False) as stream:
+        np.savez(stream, **arrays, scenes=np.array(found.scenes))
 
 
 def load_observation(file: Path) -> Observation:
@@ -175,7 +176,7 @@ def look(method: PoseEstimator, found: Observation, there: bool) -> Iterator[Row
             row["held"] = [nonconformity <= sets.find_limit(level / 100, value) for level in SHOWN]
             truth, K = (x[i].double().numpy() for x in (found.truth, found.intrinsics))
             for which, scores, of in (("", calibrated, belief), ("plain_", plain, found.belief)):
-                own = open_belief(of, i, object_model, draws if of is belief else None)
+                own = make_belief(of, i, object_model, draws if of is belief else None)
                 row[f"{which}rank"] = float(scores.rank[i])
                 row[f"{which}log_density"] = float(scores.log_density[i])
                 estimate = of.best[i].double().numpy()
@@ -183,17 +184,6 @@ def look(method: PoseEstimator, found: Observation, there: bool) -> Iterator[Row
                 row |= {f"{which}{key}": value for key, value in error.items()}
                 row[f"{which}band"] = measure_band(own, truth, hull, K, found.size)
         yield row
-
-
-def open_belief(
-    beliefs: BeliefBatch, i: int, object_model: ObjectModel, draws: torch.Tensor | None
-) -> Belief:
-    """Return one belief of a batch as users get it."""
-    weights = beliefs.log_weights[i].double().softmax(0).numpy()
-    sizes = (float(object_model.radius), float(object_model.diameter), object_model.name)
-    center, group = (x.double().numpy() for x in (object_model.center, object_model.symmetries))
-    own = 0 if draws is None else int(draws[i])
-    return Belief(beliefs.poses[i].double().numpy(), weights, center, *sizes, group, own)
 
 
 def collect(file: str, options: Any, end: float) -> bool:
@@ -356,7 +346,11 @@ def tabulate_beliefs(rows: Sequence[Row]) -> str:
                 ]
             )
     head = ["right frames of", "belief", "frames", f"ellipsoids of {LEVELS} %", "credible sets"]
-    head += ["within what it says at 95 %: shift / turn", "which is in the median", "in the band"]
+    head += [
+        "within what it says at 95 %: translation / rotation",
+        "which is in the median",
+        "in the band",
+    ]
     return draw_table([*head, "log density", "levels uniform: p"], lines)
 
 

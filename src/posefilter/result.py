@@ -63,8 +63,6 @@ class Result:
         depth_inlier_fraction: The fraction of the object's surface points, those that face away
             included, whose depth at the pose agrees with the measured one.  Earlier calibrations
             choose the group of a conformal set by it, under the name `surface`.
-        belief_calibrated: Whether the belief's width is calibrated.  It is not of instances and
-            tracks, nor by a calibration of an earlier version or of too few right estimates.
         instance: Which of its class it is, from 0, the most probable first.
         mask: The pixels (H, W) bool of the image that are its own, where instances were asked for;
             else None.
@@ -89,7 +87,6 @@ class Result:
     apparent_size: float = field(default=math.nan, kw_only=True)
     wrong_size: bool = field(default=False, kw_only=True)
     blank: str = field(default="", kw_only=True)
-    belief_calibrated: bool = field(default=False, kw_only=True)
     instance: int = field(default=0, kw_only=True)
     mask: np.ndarray | None = field(default=None, kw_only=True)
 
@@ -169,6 +166,13 @@ class Result:
         That of the estimate's own error is `belief.covariance_about(pose)`.
         """
         return self.belief.covariance
+
+    @property
+    def belief_calibrated(self) -> bool:
+        """Whether the belief's width is calibrated.  It is not of instances and tracks, nor by a
+        calibration of an earlier version or of too few right estimates.
+        """
+        return self.belief.draws > 0
 
     @property
     def modes(self) -> tuple[Mode, ...]:
@@ -332,8 +336,6 @@ def make_result(
     calibration = None if found is None else run.method.calibration
     features = {} if found is None or found.features is None else found.features
     values = {name: float(value[image]) for name, value in features.items()}
-    weights = belief.log_weights[image].double().cpu().exp().numpy()
-    center = object_model.center.detach().cpu().double().numpy()
     pose = belief.best[image].double().cpu().numpy()
     size = math.nan if run.size is None else float(run.size.scale[image])
     wrong_size = run.size is not None and bool(run.size.contradicts()[image])
@@ -351,16 +353,7 @@ def make_result(
         score=float(belief.score[image]),
         probability=None if found is None else float(found.probability[image]),
         presence=None if found is None else float(found.presence[image]),
-        belief=Belief(
-            belief.poses[image].double().cpu().numpy(),
-            weights / weights.sum(),
-            center,
-            float(object_model.radius),
-            float(object_model.diameter),
-            object_model.name,
-            object_model.symmetries.detach().cpu().double().numpy(),
-            0 if run.draws is None else int(run.draws[image]),
-        ),
+        belief=make_belief(belief, image, object_model, run.draws),
         warnings=(blank, *warnings) if blank else warnings,
         seconds=run.seconds,
         object_model=object_model,
@@ -374,7 +367,30 @@ def make_result(
         apparent_size=size,
         wrong_size=wrong_size,
         blank=blank,
-        belief_calibrated=run.draws is not None,
+    )
+
+
+def make_belief(
+    beliefs: BeliefBatch, image: int, object_model: ObjectModel, draws: torch.Tensor | None = None
+) -> Belief:
+    """Return one belief of a batch as users get it.
+
+    Args:
+        beliefs: B beliefs.
+        image: Which of them.
+        object_model: The object.
+        draws: (B,) as of `PoseEstimator.calibrate_belief`; None: not calibrated.
+    """
+    weights = beliefs.log_weights[image].double().cpu().exp().numpy()
+    return Belief(
+        beliefs.poses[image].double().cpu().numpy(),
+        weights / weights.sum(),
+        object_model.center.detach().cpu().double().numpy(),
+        float(object_model.radius),
+        float(object_model.diameter),
+        object_model.name,
+        object_model.symmetries.detach().cpu().double().numpy(),
+        0 if draws is None else int(draws[image]),
     )
 
 

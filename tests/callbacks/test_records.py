@@ -21,7 +21,7 @@ from posefilter.metrics.bop_results import (
     to_native,
     write_poses_csv,
 )
-from posefilter.types import Batch, BeliefBatch, Trace
+from posefilter.types import Batch, BeliefBatch
 
 
 def poses(count: int, seed: int = 0) -> np.ndarray:
@@ -128,7 +128,7 @@ def test_outcomes_and_beliefs(tmp_path: Path) -> None:
     belief = BeliefBatch(history, weights.log(), history[:, 1], torch.tensor([1.5, -2.0]))
     empty = torch.zeros(2)
     batch = Batch(empty, empty, empty, empty, empty, empty, torch.tensor([1, 0]), empty)
-    outcomes = collect_outcomes(Trace((), (), (), belief), batch, 0.25, [math.nan] * 2)
+    outcomes = collect_outcomes(belief, batch, 0.25, [math.nan] * 2)
     assert [(o.frame_id, o.score, o.seconds) for o in outcomes] == [(1, 1.5, 0.25), (0, -2.0, 0.25)]
     assert (outcomes[0].estimate == history[0, 1].numpy()).all()
     native_from_mesh = poses(1, seed=3)[0]

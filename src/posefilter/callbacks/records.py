@@ -13,7 +13,7 @@ from posefilter.data.frames import FrameRecord
 from posefilter.files import open_whole
 from posefilter.metrics.bop_results import PoseRow, choose_score, to_native
 from posefilter.models.base import PoseEstimator
-from posefilter.types import Batch, Trace
+from posefilter.types import Batch, BeliefBatch, Trace
 
 NativeFromMesh = Callable[[str], np.ndarray]
 
@@ -51,24 +51,21 @@ class Records(TraceCallback):
         times = method.seconds_per_image
         seconds = times[-1] if times else math.nan
         probabilities = method.last_assessment(len(batch.rgb)).probability.tolist()
-        # as the metrics and results have it
-        belief, _ = method.calibrate_belief(trace.belief, method.assess(trace, batch))
-        calibrated = trace._replace(belief=belief)
-        self.outcomes += collect_outcomes(calibrated, batch, seconds, probabilities)
+        assert method.last_belief is not None
+        self.outcomes += collect_outcomes(method.last_belief, batch, seconds, probabilities)
 
 
 def collect_outcomes(
-    trace: Trace, batch: Batch, seconds: float, probabilities: Sequence[float]
+    belief: BeliefBatch, batch: Batch, seconds: float, probabilities: Sequence[float]
 ) -> list[Outcome]:
     """Return the outcome of each image of a batch.
 
     Args:
-        trace: The run of the filter.
-        batch: Its B images.
+        belief: B beliefs.
+        batch: The B images.
         seconds: That an image took.
         probabilities: Of the B estimates; NaN where the method is not calibrated.
     """
-    belief = trace.belief
     best = belief.best.detach().cpu().double().numpy()
     poses = belief.poses.detach().cpu().float().numpy()
     weights = belief.log_weights.detach().exp().cpu().float().numpy()

@@ -185,11 +185,10 @@ def learn(
     scores = measure_quality(frames, held)
     quality = {key: float(scores[key]) for key in _SHOWN if math.isfinite(scores[key])}
     own = frames.present
-    scale, surprise = fit_beliefs(
+    nonconformity = np.full(len(own), np.nan)
+    scale, nonconformity[own] = fit_beliefs(
         beliefs, held.probability[own], frames.correct[own], method.object_model
     )
-    nonconformity = np.full(len(own), np.nan)
-    nonconformity[own] = surprise
     frames = frames._replace(nonconformity=nonconformity)
     return fit_calibration(frames, source, quality, first, scale)
 

@@ -54,8 +54,7 @@ class BeliefScale:
 
     def find_factor(self, probability: Tensor) -> Tensor:
         """Return the factor of estimates with a probability of being right, (B,) -> (B,)."""
-        logit = torch.special.logit(probability.double()).clamp(-_LOGIT, _LOGIT)
-        return (self.bias + self.slope * logit).exp()
+        return (self.bias + self.slope * _limit_logit(probability)).exp()
 
 
 class PoseSpread(NamedTuple):
@@ -95,19 +94,19 @@ def fit_belief_scale(spread: PoseSpread, probability: Tensor) -> BeliefScale | N
 
     if len(probability) < FEWEST_RIGHT:
         return None
-    logit = torch.special.logit(probability.double()).clamp(-_LOGIT, _LOGIT).numpy()
+    logit = _limit_logit(probability).numpy()
     within = torch.linalg.solve(spread.scatter, spread.twist[..., None])[..., 0]
     distance = (within * spread.twist).sum(-1).numpy()  # squared, of Mahalanobis
     mean, deviation = (np.array(x) for x in zip(_BIAS, _SLOPE, strict=True))
 
-    def surprise(x: np.ndarray) -> float:
-        """Return minus the log posterior, up to a constant."""
+    def negative_log_posterior(x: np.ndarray) -> float:
+        """Return it up to a constant, of bias and slope."""
         log_factor = x[0] + x[1] * logit
         tail = np.log1p(distance * np.exp(-2 * log_factor) / _DEGREES)
         own = 6 * log_factor + 0.5 * (_DEGREES + 6) * tail
         return float(own.sum() + 0.5 * np.square((x - mean) / deviation).sum())
 
-    bias, slope = minimize(surprise, mean, method="Nelder-Mead").x
+    bias, slope = minimize(negative_log_posterior, mean, method="Nelder-Mead").x
     return BeliefScale(float(bias), float(slope))
 
 
@@ -239,6 +238,11 @@ def _twist_near(best: Tensor, poses: Tensor, object_model: ObjectModel) -> Tenso
     )
     copies = gather_copies(poses, best, center, object_model.radius, densify(group))
     return twist_between(best, copies, center)
+
+
+def _limit_logit(probability: Tensor) -> Tensor:
+    """Return the log odds of probabilities, as far as frames can tell them."""
+    return torch.special.logit(probability.double()).clamp(-_LOGIT, _LOGIT)
 
 
 def _unit(object_model: ObjectModel) -> Tensor:

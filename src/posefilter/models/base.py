@@ -103,6 +103,7 @@ class PoseEstimator(Module):
         self._first: tuple[nn.Module, ...] = ()  # the first module that has weights
         self._scores: Any = None  # made when they are first asked for
         self.seconds_per_image: list[float] = []
+        self.last_belief: BeliefBatch | None = None  # of the batch that the metrics took in last
         self.skipped_steps = self.skipped_in_a_row = 0  # whose gradient was not finite
         self.recipe: dict[str, Any] = {}  # how it was built: plain data, carried in its checkpoints
 
@@ -443,12 +444,14 @@ class PoseEstimator(Module):
             batch.mask, self.particle_pixels(trace.particles[-1], batch)
         )
         best, true_pose = trace.belief.best, batch.camera_from_object
+        self.last_belief = trace.belief
         if "poses" in self.scores:
             self.scores["poses"].update(best, true_pose)
             self.scores["bop"].update(best, true_pose, batch.intrinsics, width)
             self.scores["by_visibility"].collect(best, true_pose, batch.visibility)
             found = self.judge_confidence(trace, batch, present=True)
             belief, _ = self.calibrate_belief(trace.belief, found)
+            self.last_belief = belief
             self.scores["belief"].update(belief, true_pose)
             seen = score_truth(belief, true_pose, self.object_model)
             self.scores["credibility"].update(seen, batch.visibility)
