@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from confidence import is_right
+from confidence import is_right_pose
 from held_out import read_frames
 from marked import format_row, put_table
 
@@ -39,7 +39,7 @@ def ask(estimator: posefilter.Estimator, sample: Sample) -> list[dict[str, Any]]
     out = []
     for factor in FACTORS:
         result = estimator.predict(sample.rgb, factor * sample.depth, sample.intrinsics)
-        right = is_right(result, sample)
+        right = is_right_pose(result, sample.camera_from_object.astype(np.float64))
         if factor == 1.0 and not right:
             return None
         assert result.presence is not None

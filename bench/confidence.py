@@ -95,10 +95,12 @@ def list_images(reader: BaseReader, every: int) -> list[list[int]]:
     return [own for many in scenes.values() for own in many[::every]]
 
 
-def is_right(result: Result, sample: Sample) -> bool:
-    """Return whether a pose keeps the tolerance that was asked for, else 0.1 diameters (ADD)."""
-    truth = torch.from_numpy(sample.camera_from_object).double()[None]
-    errors = measure_pose_errors(torch.from_numpy(result.pose)[None], truth, result.object_model)
+def is_right_pose(result: Result, truth: np.ndarray) -> bool:
+    """Return whether a pose keeps the tolerance that was asked for, else 0.1 diameters (ADD);
+    truth (4, 4).
+    """
+    true = torch.from_numpy(truth).double()[None]
+    errors = measure_pose_errors(torch.from_numpy(result.pose)[None], true, result.object_model)
     return bool((result.pose_tolerance or RIGHT).accepts(errors))
 
 
@@ -164,8 +166,8 @@ def look(
             row |= {"apparent_size": result.apparent_size, "wrong_size": result.wrong_size}
             if result.object in there:
                 sample = there[result.object]
-                row["right"] = is_right(result, sample)
                 truth = sample.camera_from_object.astype(np.float64)
+                row["right"] = is_right_pose(result, truth)
                 row |= measure_error(result.belief, result.pose, truth)
             rows.append(row)
             print(json.dumps(row), flush=True)

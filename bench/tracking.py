@@ -6,6 +6,8 @@
 
     python bench/tracking.py (--frames DIR | --sequences DIR) --meshes DIR --together 1 --together 4
 
+    python bench/tracking.py (--frames DIR | --sequences DIR=OBJECT ...) --meshes DIR --beliefs
+
 For each of YCB-Video's objects whose weights ship and that is in the scenes: every frame by itself,
 then the same frames tracked, in one process. Figures are means over seeds, of single images over
 the first four, and ± is the standard error of such a mean. Times are the processor's of this
@@ -17,18 +19,22 @@ generate.py with moving= and fully_occluded_frames=: there the losses are in the
 operation's work out to, and by two processes that have an object each: in turn, by the clock, on an
 idle machine if the figures are to mean anything. Of the processor's time it is the first process'
 share. Objects that a scene lacks are taken where it has too few, and are searched for in every
-frame. Writes the tables of docs/results/tracking.md; rows of what did not run stay.
+frame. With --beliefs, how often a track's belief holds the truth where its estimate is right,
+calibrated and as the particles alone. Writes the tables of docs/results/tracking.md; rows of what
+did not run stay.
 """
 
 import argparse
 import math
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 import torch
+from confidence import is_right_pose, measure_error
 from marked import put_table, read_rows
 
 import posefilter
@@ -36,6 +42,7 @@ from posefilter.data.readers.registry import open_meshes, open_reader
 from posefilter.data.sequences import SceneVideo, VideoFrame, list_groups
 from posefilter.memory import keep_freed_memory
 from posefilter.meshes import ycb
+from posefilter.metrics.credibility import SHOWN
 from posefilter.metrics.errors import add, add_s
 from posefilter.metrics.scores import auc
 from posefilter.metrics.tracks import measure_jitter
@@ -61,6 +68,11 @@ SEQUENCES = (
     "covered: said to be there", "recovered after",
 )  # fmt: skip
 RANDOM_WALK = ConstantVelocity(velocity_gain=0, max_noise_scale=1)
+BELIEFS = (
+    "object", "frames of", "scenes", "belief", "right frames",
+    f"ellipsoids of {' / '.join(map(str, SHOWN))} %", "off: mm", "degrees", "says: mm", "degrees",
+    "holds: translation %", "rotation %",
+)  # fmt: skip
 TOGETHER = (
     "scene", "objects", "of these away", "frames", "threads", "frame ms", "mean", "slowest",
     "frames/s", "CPU ms", "ADD AUC, mean", "least", "frames lost",
@@ -365,14 +377,91 @@ def run_together(options: argparse.Namespace, names: Sequence[str]) -> None:
 def run_sequences(folders: Sequence[str], meshes: str, seeds: int) -> None:
     """Measure rendered sequences, a folder and its object each, print and write."""
     lines = []
-    for folder, name in (pair.rsplit("=", 1) for pair in folders):
+    for name, folder, scenes in open_sequences(folders, meshes):
         estimator = posefilter.load(name, device="cpu")
-        reader = open_reader("fat", folder, None, open_meshes(meshes, None, "fat", [name]))
-        for group in list_groups(reader):
-            frames = list(SceneVideo(reader, group, [name]))
-            lines.append(measure_sequence(estimator, Path(folder).name, frames, seeds))
+        for scene in scenes:
+            lines.append(measure_sequence(estimator, folder, list(scene), seeds))
             print(lines[-1], flush=True)
     write_table("sequences", SEQUENCES, lines, 2)
+
+
+def measure_beliefs(
+    estimator: posefilter.Estimator, frames: Sequence[VideoFrame], seeds: int
+) -> dict[str, list[dict[str, Any]]]:
+    """Return how far right estimates of tracked frames are off, and what their beliefs say of that:
+    those of the results, and the particles alone.
+    """
+    rows: dict[str, list[dict[str, Any]]] = {"calibrated": [], "particles": []}
+    for seed in range(seeds):
+        tracker = posefilter.Tracker(estimator, seed=seed)
+        (track,) = tracker.tracks
+        for frame in frames:
+            result = tracker.update(frame.rgb, frame.depth, frame.intrinsics)
+            truth = frame.truth.get(result.object)
+            if truth is None or result.status in ("started", "lost"):
+                continue
+            truth = truth.astype(np.float64)
+            if not is_right_pose(result, truth) or not result.belief_calibrated:
+                continue
+            assert track.state is not None
+            poses, weights = track.state.belief.state, track.state.belief.log_weights.softmax(1)
+            particles = replace(
+                result.belief,
+                samples=poses[0].double().cpu().numpy(),
+                weights=weights[0].double().cpu().numpy(),
+                draws=0,
+            )
+            for name, belief in (("calibrated", result.belief), ("particles", particles)):
+                rows[name].append(measure_error(belief, result.pose, truth))
+    return rows
+
+
+def list_belief_rows(
+    name: str, source: str, scenes: int, rows: Mapping[str, Sequence[Mapping[str, Any]]]
+) -> Iterator[str]:
+    """Yield the lines of an object's beliefs in the table, one of each kind."""
+    for kind, own in rows.items():
+        if not own:
+            continue
+        levels = [[row["level"] < level / 100 for level in SHOWN] for row in own]
+        off, says = (1000, 180 / math.pi) * np.array(
+            [np.median([row[key] for row in own], axis=0) for key in ("off", "says")]
+        )
+        within = 100 * np.mean([row["within"] for row in own], axis=0)
+        cells = [name, source, str(scenes), kind, str(len(own))]
+        cells.append(" / ".join(f"{100 * x:.0f}" for x in np.mean(levels, axis=0)))
+        cells += [f"{x:.1f}" for x in (*off, *says)] + [f"{x:.0f}" for x in within]
+        yield f"| {' | '.join(cells)} |"
+
+
+def run_beliefs(videos: Sequence[tuple[str, str, Sequence[SceneVideo]]], seeds: int) -> None:
+    """Measure the beliefs of tracks, print and write.
+
+    Args:
+        videos: Objects, the source of their frames, and the scenes.
+        seeds: Of the filter.
+    """
+    lines = []
+    for name, source, scenes in videos:
+        estimator = posefilter.load(name, device="cpu")
+        rows: dict[str, list[dict[str, Any]]] = {}
+        for scene in scenes:
+            for kind, found in measure_beliefs(estimator, list(scene), seeds).items():
+                rows.setdefault(kind, []).extend(found)
+        for line in list_belief_rows(name, source, len(scenes), rows):
+            lines.append(line)
+            print(line, flush=True)
+    write_table("beliefs", BELIEFS, lines, 4)
+
+
+def open_sequences(
+    pairs: Sequence[str], meshes: str
+) -> Iterator[tuple[str, str, list[SceneVideo]]]:
+    """Yield of each DIR=OBJECT the object, the folder's name, and its scenes."""
+    for folder, name in (pair.rsplit("=", 1) for pair in pairs):
+        reader = open_reader("fat", folder, None, open_meshes(meshes, None, "fat", [name]))
+        scenes = [SceneVideo(reader, group, [name]) for group in list_groups(reader)]
+        yield name, Path(folder).name, scenes
 
 
 def write_table(name: str, head: Sequence[str], lines: Sequence[str], keys: int) -> None:
@@ -394,6 +483,7 @@ def main() -> None:
     parser.add_argument("--only", action="append", help="an object; can be repeated")
     parser.add_argument("--stride", type=int, action="append", help="1, and 4 of the tracks")
     parser.add_argument("--losses", action="store_true", help="the induced track losses alone")
+    parser.add_argument("--beliefs", action="store_true", help="what tracks' beliefs are worth")
     parser.add_argument("--threads", type=int, default=1)
     parser.add_argument("--together", type=int, action="append", help="objects at once")
     parser.add_argument("--scene", help="of --together; all without it")
@@ -404,6 +494,9 @@ def main() -> None:
     names = options.only or [name for name in list_shipped() if name in ycb.CLASSES]
     if options.together:
         run_together(options, names)
+        return
+    if options.sequences and options.beliefs:
+        run_beliefs(list(open_sequences(options.sequences, options.meshes)), options.seeds)
         return
     if options.sequences:
         run_sequences(options.sequences, options.meshes, options.seeds)
@@ -416,6 +509,12 @@ def main() -> None:
         subsets=["data"],
     )
     groups = list_groups(reader)
+    if options.beliefs:
+        scenes = [(group, SceneVideo(reader, group, names).objects or ()) for group in groups]
+        each = [(group, name) for group, own in scenes for name in own]
+        videos = [(name, group, [SceneVideo(reader, group, [name])]) for group, name in each]
+        run_beliefs(videos, options.seeds)
+        return
     every = {group: SceneVideo(reader, group, names) for group in groups}
     rows, losses = [], []
     for group, video in every.items():

@@ -160,10 +160,19 @@ class Estimator:
             many = Counter(each.number for each in found)
             before, results = Counter[int](), []
             for each in found:
-                number, trace = each.number, Trace((), (), (), each.belief)
+                number = each.number
                 spent = seconds[number] / many[number]
                 method, batch = self.methods[number], batches[number]
-                run = Run(method, batch, trace, spent, each.assessment, blank=blank[i : i + 1])
+                belief, draws = method.calibrate_belief(each.belief, each.assessment)
+                run = Run(
+                    method,
+                    batch,
+                    Trace((), (), (), belief),
+                    spent,
+                    each.assessment,
+                    blank=blank[i : i + 1],
+                    draws=draws,
+                )
                 result = make_result(run, 0, self.costs, self.pose_tolerance)
                 mask = resize_mask(each.mask, size).cpu().numpy()
                 # a conformal set holds for the filter that was calibrated, this one is smaller

@@ -169,8 +169,8 @@ class Result:
 
     @property
     def belief_calibrated(self) -> bool:
-        """Whether the belief's width is calibrated.  It is not of instances and tracks, nor by a
-        calibration of an earlier version or of too few right estimates.
+        """Whether the belief's width is calibrated.  It is not where a calibration is of an earlier
+        version or of too few right estimates, nor that of a track in a frame that did not show it.
         """
         return self.belief.draws > 0
 

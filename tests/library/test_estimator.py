@@ -221,6 +221,16 @@ def test_an_image_of_one_color_or_depth_is_doubted(estimator: posefilter.Estimat
     assert found.verdict == "unsure"
 
 
+def test_the_belief_of_an_instance_is_as_wide_as_errors_are(
+    estimator: posefilter.Estimator,
+) -> None:
+    images = read_scene(0, ONE_MODE)
+    one, (instance,) = estimator.predict(*images), estimator.predict(*images, instances=1)
+    assert instance.belief_calibrated
+    sure, as_instance = one.belief.uncertainty(), instance.belief.uncertainty()
+    assert 0.5 < as_instance.translation / sure.translation < 2  # the particles' is 2.5 times it
+
+
 def test_tensors_and_floats_are_the_same_image(small: posefilter.Estimator) -> None:
     rgb, depth, K = read_scene()
     arrays = small.predict(rgb, depth, K)

@@ -8,6 +8,7 @@ import torch
 from tests.tracking.toy import DEPTH, RGB, SPACE, K, make_toy, walk_pose
 
 import posefilter
+from posefilter.confidence.belief_scale import BeliefScale
 from posefilter.confidence.calibration import Calibration, Logistic, tabulate_errors
 from posefilter.confidence.conformal import Conformal
 from posefilter.errors import UserError
@@ -43,7 +44,7 @@ def test_a_moving_object_is_followed_with_few_particles() -> None:
         assert off(result, pose) < 0.008
         assert result.objectness > 0.8
         if number:
-            assert len(result.belief.weights) < 150 < toy.filter.particles
+            assert result.particles < 150 < toy.filter.particles
     assert result.object == "toy"
     assert result.belief.weights.sum() == pytest.approx(1)
 
@@ -175,6 +176,37 @@ def test_a_track_has_no_conformal_sets() -> None:
         result = tracker.update(RGB, DEPTH, K)
         with pytest.raises(UserError, match=r"no conformal sets .* not of a track"):
             result.conformal_set(0.9)
+
+
+def test_a_tracks_belief_is_calibrated_where_it_was_measured() -> None:
+    toy, estimator = make_toy()
+    toy.calibration = Calibration(
+        ("score",), (-5.0,), (2.0,), Logistic((3.0,), 0.0), Logistic((3.0,), 0.0),
+        {"right": 20, "wrong": 0, "absent": 20}, "toy", {}, belief_scale=BeliefScale(-1.0, 0.0),
+    )  # fmt: skip
+    tracker, pose = posefilter.Tracker(estimator), walk_pose(1)[0]
+    seen, hidden = range(8), range(8, 14)
+    for number in (*seen, *hidden):
+        toy.truth = pose if number in seen else None
+        result = tracker.update(RGB, DEPTH, K)
+        state = tracker.tracks[0].state
+        assert state is not None
+        assert result.particles == state.belief.state.shape[1]
+        assert result.belief_calibrated == (number in seen)
+        if number not in seen:
+            continue
+        # the particles that the next frame starts from are not touched, and are e times as wide
+        particles = dataclasses.replace(
+            result.belief,
+            samples=state.belief.state[0].double().numpy(),
+            weights=state.belief.log_weights[0].double().softmax(0).numpy(),
+            draws=0,
+        )
+        widths = [
+            np.sqrt(np.trace(one.covariance_about(result.pose)[:3, :3]))
+            for one in (result.belief, particles)
+        ]
+        assert 0.25 < widths[0] / widths[1] < 0.75  # e^-1 sqrt(5 / 3) = 0.47, and the prior
 
 
 def test_a_tracks_verdict_goes_by_the_costs_and_the_tolerance_of_its_estimator() -> None:

@@ -139,7 +139,7 @@ def describe_row(row: TrackRow) -> dict[str, Any]:
         "objectness": result.objectness,
         "presence": result.presence,
         "probability": result.probability,
-        "particles": len(result.belief.weights),
+        "particles": result.particles,
         "standard_deviations": np.sqrt(np.diag(result.covariance)).tolist(),
         "add_mm": 1000 * row.add,
         "add_s_mm": 1000 * row.add_s,

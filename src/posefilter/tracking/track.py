@@ -55,13 +55,16 @@ class TrackResult(Result):
             "recovered" after a loss, or "lost": then the pose is no more than a guess.
         objectness: What the network says of the pixels that the object covers: the mean probability
             that they show it. Occlusion lowers it. It is not calibrated.
+        particles: How many particles the next frame starts from.
 
+    The belief is calibrated by what errors of single images taught, where the frame was measured.
     `presence` and `probability` are those of an estimate on a single image with the same features;
     a track is judged lost or recovered by the presence.
     """
 
     status: str
     objectness: float
+    particles: int
 
     @property
     def is_tracked(self) -> bool:
@@ -190,11 +193,14 @@ class Track:
         belief = sight.belief if trusted or predicted is None else None
         self.state = self._correct(predicted, belief, status)
         self.frames += 1
-        run = self._describe(sight, frame.blank)
+        run = self._describe(sight, frame.blank, measured=belief is not None)
         result = make_result(run, 0, self.costs, self.pose_tolerance)
         # the guarantee of conformal sets is of the filter that was calibrated, no track's
         content = {**vars(result), "seconds": time.perf_counter() - start, "conformal": None}
-        return TrackResult(**content, status=status, objectness=sight.objectness)
+        count = 0 if self.state is None else self.state.belief.state.shape[1]
+        return TrackResult(
+            **content, status=status, objectness=sight.objectness, particles=count
+        )
 
     # -- the steps of a frame ---------------------------------------------------------------------
 
@@ -389,9 +395,13 @@ class Track:
         presence, found = measure_presence(self.method, trace, batch, objectness)
         return FrameEstimate(batch, belief, objectness, presence, found)
 
-    def _describe(self, sight: FrameEstimate, blank: str) -> Run:
-        """Return the state as an estimator's run on what was looked at."""
-        state = self.state
+    def _describe(self, sight: FrameEstimate, blank: str, measured: bool) -> Run:
+        """Return the state as an estimator's run on what was looked at.
+
+        Where the state is not `measured`, its belief is the predicted one, of which the calibration
+        knows nothing.
+        """
+        state, draws = self.state, None
         if state is None:  # no more than a guess: a meter ahead
             ahead = torch.eye(4, device=self.method.device)
             ahead[:3, 3] = ahead.new_tensor([0.0, 0.0, 1.0]) - self.method.object_model.center.to(
@@ -405,9 +415,18 @@ class Track:
         score = state.best.new_full((1,), -torch.inf)
         score = score if sight.belief is None else sight.belief.score
         belief = BeliefBatch(state.belief.state, state.belief.log_weights, state.best, score)
+        if measured:
+            belief, draws = self.method.calibrate_belief(belief, sight.found)
         trace = Trace((), (), (), belief)
         return Run(
-            self.method, sight.batch, trace, 0.0, sight.found, size=sight.size, blank=[blank]
+            self.method,
+            sight.batch,
+            trace,
+            0.0,
+            sight.found,
+            size=sight.size,
+            blank=[blank],
+            draws=draws,
         )
 
 
