@@ -15,10 +15,10 @@ import argparse
 import json
 import math
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -33,6 +33,7 @@ from posefilter.data.readers.base import BaseReader
 from posefilter.data.readers.registry import open_meshes, open_reader
 from posefilter.errors import UserError
 from posefilter.geometry.pose_statistics import twist_between
+from posefilter.metrics.credibility import SHOWN
 from posefilter.result import Result
 
 Inputs = tuple[np.ndarray, np.ndarray, np.ndarray]
@@ -128,6 +129,24 @@ def measure_error(belief: Belief, estimate: np.ndarray, truth: np.ndarray) -> di
     return {"off": off, "says": says, "within": within, "level": level}
 
 
+class ErrorSummary(NamedTuple):
+    """What beliefs are worth, of estimates that are right."""
+
+    off: np.ndarray  # (2,) median translation [mm] and rotation [degrees]
+    says: np.ndarray  # (2,) what beliefs say of these at 95 %, in the median
+    within: np.ndarray  # (2,) how often each is within it [%]
+    ellipsoids: np.ndarray  # (4,) how often those of `SHOWN` hold the truth [%]
+
+
+def summarize_errors(rows: Sequence[Mapping[str, Any]]) -> ErrorSummary:
+    """Return the figures of what `measure_error` gives of right estimates, one at least."""
+    units = np.array([1000, 180 / math.pi])
+    off, says = (units * np.median([row[key] for row in rows], axis=0) for key in ("off", "says"))
+    within = 100 * np.mean([row["within"] for row in rows], axis=0)
+    inside = [[row["level"] < level / 100 for level in SHOWN] for row in rows]
+    return ErrorSummary(off, says, within, 100 * np.mean(inside, axis=0))
+
+
 def read_tolerance(words: list[str]) -> PoseTolerance | None:
     """Return the tolerance of words such as add_s=0.1; None where there are none."""
     pairs = (one.split("=") for one in words)
@@ -198,10 +217,8 @@ def tabulate_errors(rows: list[dict[str, Any]]) -> str:
     own = [row for row in rows if row.get("right") and "off" in row]
     for name in [*dict.fromkeys(row["object"] for row in own), "all"] if own else []:
         some = [row for row in own if name in (row["object"], "all")]
-        pairs = (np.median([row[key] for row in some], axis=0) for key in ("off", "says"))
-        words = [
-            f"{1000 * shift:.1f} mm, {math.degrees(turn):.1f} degrees" for shift, turn in pairs
-        ]
+        found = summarize_errors(some)
+        words = [f"{shift:.1f} mm, {turn:.1f} degrees" for shift, turn in (found.off, found.says)]
         within = np.sum([row["within"] for row in some], axis=0)
         inside = [sum(row["level"] < level for row in some) for level in (0.5, 0.95)]
         cells = [name, len(some), *words, *within, " and ".join(map(str, inside))]

@@ -8,6 +8,8 @@
 A frame counts in the first table where every instance is visible to more than `--visible`. An
 instance is found where a result, matched to it, has an ADD below 0.1 diameters up to the object's
 symmetries; results are matched by falling probability, each to the nearest instance that is free.
+Of these the beliefs are measured: how far the estimate is off, what the belief says of that, and
+how often its ellipsoids hold the truth.
 The cost is the processor's time of a call that asks for all instances over that of one that asks
 for the one object; with `--classes`, also that of a call for so many objects whose weights ship.
 """
@@ -24,6 +26,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from confidence import measure_error, summarize_errors
 
 import posefilter
 from posefilter.data.frames import FrameRecord, Sample
@@ -78,13 +81,15 @@ def judge(
     wanted = len(samples)
     results, several = take_time(lambda: estimator.predict(*image, instances=wanted, seed=seed))
     _, one = take_time(lambda: estimator.predict(*image, seed=seed))
-    errors = measure_errors(results, [s.camera_from_object.astype(np.float64) for s in samples])
-    pairs = match_greedily(errors, 0.1)
+    truths = [s.camera_from_object.astype(np.float64) for s in samples]
+    pairs = match_greedily(measure_errors(results, truths), 0.1)
+    beliefs = [measure_error(results[r].belief, results[r].pose, truths[t]) for r, t in pairs]
     overlap = sum(one.mask.astype(int) for one in results).max() if results else 0
     return {
         "instances": wanted,
         "visible": shares,
         "found": sorted(t for _, t in pairs),
+        "beliefs": beliefs,
         "results": len(results),
         "declared": sum(one.verdict == "found" for one in results),
         "declared_right": sum(results[r].verdict == "found" for r, _ in pairs),
@@ -118,6 +123,8 @@ def summarize(rows: list[dict[str, Any]], visible: float) -> dict[str, Any]:
     seen = [(v, k in row["found"]) for row in rows for k, v in enumerate(row["visible"])]
     many = [found for v, found in seen if v > visible]
     share = lambda part: 100 * sum(part) / len(part) if part else float("nan")  # noqa: E731
+    own = [one for row in rows for one in row["beliefs"]]
+    found = summarize_errors(own)._asdict() if own else {}
     return {
         "frames": len(rows),
         "clear_frames": len(clear),
@@ -130,6 +137,8 @@ def summarize(rows: list[dict[str, Any]], visible: float) -> dict[str, Any]:
         "seconds_several": statistics.median(r["seconds"] for r in rows),
         "seconds_one": statistics.median(r["seconds_one"] for r in rows),
         "cost": statistics.median(r["seconds"] / r["seconds_one"] for r in rows),
+        "beliefs": len(own),
+        **{f"beliefs_{key}": value.round(1).tolist() for key, value in found.items()},
     }
 
 

@@ -34,7 +34,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from confidence import is_right_pose, measure_error
+from confidence import is_right_pose, measure_error, summarize_errors
 from marked import put_table, read_rows
 
 import posefilter
@@ -423,14 +423,11 @@ def list_belief_rows(
     for kind, own in rows.items():
         if not own:
             continue
-        levels = [[row["level"] < level / 100 for level in SHOWN] for row in own]
-        off, says = (1000, 180 / math.pi) * np.array(
-            [np.median([row[key] for row in own], axis=0) for key in ("off", "says")]
-        )
-        within = 100 * np.mean([row["within"] for row in own], axis=0)
+        found = summarize_errors(own)
         cells = [name, source, str(scenes), kind, str(len(own))]
-        cells.append(" / ".join(f"{100 * x:.0f}" for x in np.mean(levels, axis=0)))
-        cells += [f"{x:.1f}" for x in (*off, *says)] + [f"{x:.0f}" for x in within]
+        cells.append(" / ".join(f"{x:.0f}" for x in found.ellipsoids))
+        cells += [f"{x:.1f}" for x in (*found.off, *found.says)]
+        cells += [f"{x:.0f}" for x in found.within]
         yield f"| {' | '.join(cells)} |"
 
 

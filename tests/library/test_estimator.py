@@ -228,7 +228,7 @@ def test_the_belief_of_an_instance_is_as_wide_as_errors_are(
     one, (instance,) = estimator.predict(*images), estimator.predict(*images, instances=1)
     assert instance.belief_calibrated
     sure, as_instance = one.belief.uncertainty(), instance.belief.uncertainty()
-    assert 0.5 < as_instance.translation / sure.translation < 2  # the particles' is 2.5 times it
+    assert 0.7 < as_instance.translation / sure.translation < 1.4  # the particles' is 1.7 times it
 
 
 def test_tensors_and_floats_are_the_same_image(small: posefilter.Estimator) -> None:

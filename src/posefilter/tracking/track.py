@@ -198,9 +198,7 @@ class Track:
         # the guarantee of conformal sets is of the filter that was calibrated, no track's
         content = {**vars(result), "seconds": time.perf_counter() - start, "conformal": None}
         count = 0 if self.state is None else self.state.belief.state.shape[1]
-        return TrackResult(
-            **content, status=status, objectness=sight.objectness, particles=count
-        )
+        return TrackResult(**content, status=status, objectness=sight.objectness, particles=count)
 
     # -- the steps of a frame ---------------------------------------------------------------------
 
