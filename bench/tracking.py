@@ -438,16 +438,19 @@ def run_beliefs(videos: Sequence[tuple[str, str, Sequence[SceneVideo]]], seeds: 
         videos: Objects, the source of their frames, and the scenes.
         seeds: Of the filter.
     """
-    lines = []
+    lines, every, count = [], dict[str, list[dict[str, Any]]](), 0
     for name, source, scenes in videos:
         estimator = posefilter.load(name, device="cpu")
         rows: dict[str, list[dict[str, Any]]] = {}
         for scene in scenes:
             for kind, found in measure_beliefs(estimator, list(scene), seeds).items():
                 rows.setdefault(kind, []).extend(found)
-        for line in list_belief_rows(name, source, len(scenes), rows):
-            lines.append(line)
-            print(line, flush=True)
+                every.setdefault(kind, []).extend(found)
+        lines += list_belief_rows(name, source, len(scenes), rows)
+        count += len(scenes)
+        print(*lines[-2:], sep="\n", flush=True)
+    if len(videos) > 1:
+        lines += list_belief_rows("all", "all of these", count, every)
     write_table("beliefs", BELIEFS, lines, 4)
 
 
