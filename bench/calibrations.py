@@ -1,7 +1,7 @@
 """Calibrate weights files anew, on scenes of their own that no training and no test has.
 
-    python bench/calibrations.py --root DIR --meshes DIR [--frames 400] [--each 90] [--list]
-        [FILE.ckpt ...]
+    python bench/calibrations.py --root DIR --meshes DIR [--frames 400] [--without 240] [--each 90]
+        [--list] [FILE.ckpt ...]
 
 Without files, all of weights/ are.  A calibration replaces the one that the file has, in place.
 The scenes are rendered first, below DIR of --root, `--each` frames for each of the 14 objects, by
@@ -30,16 +30,19 @@ def render_commands(root: Path, each: int) -> list[list[str]]:
     return [[*words, "progress=false"] for words in sets]
 
 
-def calibrate_command(file: Path, root: Path, frames: int) -> list[str]:
+def calibrate_command(file: Path, root: Path, frames: int, without: int) -> list[str]:
     """Return what to run to calibrate one file, in place."""
     words = ["data=fat", f"data.root={root / 'data'}", f"data.meshes={root / 'meshes'}"]
     words += ["data.split={val: 1.0}", "data.min_visibility_test=0.1", f"frames={frames}"]
+    words.append(f"absent_frames={without}")
     return ["calibrate.py", f"checkpoint={file}", *words, "overwrite=true", "threads=1"]
 
 
-def list_commands(files: Sequence[Path], root: Path, frames: int, each: int) -> list[list[str]]:
+def list_commands(
+    files: Sequence[Path], root: Path, frames: int, without: int, each: int
+) -> list[list[str]]:
     """Return all commands, in their order."""
-    own = [calibrate_command(file.resolve(), root, frames) for file in files]
+    own = [calibrate_command(file.resolve(), root, frames, without) for file in files]
     return [*render_commands(root, each), *own]
 
 
@@ -51,7 +54,8 @@ def main() -> int:
     parser.add_argument("files", nargs="*", type=Path)
     parser.add_argument("--root", type=Path, required=True)
     parser.add_argument("--meshes", type=Path, required=True, help="a folder of YCB's meshes")
-    parser.add_argument("--frames", type=int, default=400, help="with the object, and without")
+    parser.add_argument("--frames", type=int, default=400, help="with the object")
+    parser.add_argument("--without", type=int, help="without it; as many, unless said")
     parser.add_argument("--each", type=int, default=90, help="frames rendered for each object")
     parser.add_argument("--list", action="store_true", help="print the commands, run nothing")
     options = parser.parse_args()
@@ -62,7 +66,8 @@ def main() -> int:
     root, worst = options.root.resolve(), 0
     if not options.list:
         photographs.link_meshes(root, options.meshes)
-    for words in list_commands(files, root, options.frames, options.each):
+    without = options.frames if options.without is None else options.without
+    for words in list_commands(files, root, options.frames, without, options.each):
         print(f"$ python {shlex.join(words)}", flush=True)
         if options.list:
             continue

@@ -431,26 +431,32 @@ def list_belief_rows(
         yield f"| {' | '.join(cells)} |"
 
 
-def run_beliefs(videos: Sequence[tuple[str, str, Sequence[SceneVideo]]], seeds: int) -> None:
+def run_beliefs(
+    videos: Sequence[tuple[str, Sequence[SceneVideo]]], source: str, seeds: int
+) -> None:
     """Measure the beliefs of tracks, print and write.
 
     Args:
-        videos: Objects, the source of their frames, and the scenes.
+        videos: Objects and their scenes.
+        source: What the scenes are.
         seeds: Of the filter.
+
+    Particles alone have a line of all objects only, where there are several.
     """
     lines, every, count = [], dict[str, list[dict[str, Any]]](), 0
-    for name, source, scenes in videos:
+    for name, scenes in videos:
         estimator = posefilter.load(name, device="cpu")
         rows: dict[str, list[dict[str, Any]]] = {}
         for scene in scenes:
             for kind, found in measure_beliefs(estimator, list(scene), seeds).items():
                 rows.setdefault(kind, []).extend(found)
                 every.setdefault(kind, []).extend(found)
-        lines += list_belief_rows(name, source, len(scenes), rows)
+        own = {"calibrated": rows["calibrated"]} if len(videos) > 1 else rows
+        lines += list_belief_rows(name, source, len(scenes), own)
         count += len(scenes)
-        print(*lines[-2:], sep="\n", flush=True)
+        print(*lines[-1:], flush=True)
     if len(videos) > 1:
-        lines += list_belief_rows("all", "all of these", count, every)
+        lines += list_belief_rows(f"{len(videos)} objects", source, count, every)
     write_table("beliefs", BELIEFS, lines, 4)
 
 
@@ -496,7 +502,8 @@ def main() -> None:
         run_together(options, names)
         return
     if options.sequences and options.beliefs:
-        run_beliefs(list(open_sequences(options.sequences, options.meshes)), options.seeds)
+        each = open_sequences(options.sequences, options.meshes)
+        run_beliefs([(name, scenes) for name, _, scenes in each], "renders", options.seeds)
         return
     if options.sequences:
         run_sequences(options.sequences, options.meshes, options.seeds)
@@ -510,10 +517,10 @@ def main() -> None:
     )
     groups = list_groups(reader)
     if options.beliefs:
-        scenes = [(group, SceneVideo(reader, group, names).objects or ()) for group in groups]
-        each = [(group, name) for group, own in scenes for name in own]
-        videos = [(name, group, [SceneVideo(reader, group, [name])]) for group, name in each]
-        run_beliefs(videos, options.seeds)
+        there = [(group, SceneVideo(reader, group, names).objects or ()) for group in groups]
+        pairs = [(group, name) for group, own in there for name in own]
+        videos = [(name, [SceneVideo(reader, group, [name])]) for group, name in pairs]
+        run_beliefs(videos, "photographs", options.seeds)
         return
     every = {group: SceneVideo(reader, group, names) for group in groups}
     rows, losses = [], []

@@ -136,6 +136,7 @@ RANGES: dict[str, Range] = {
     "convert_bag.max_time_difference": Range(0, 10),
     "evaluate.absent_frames": COUNT_OR_NONE,
     "calibrate.frames": _whole(10, 1_000_000),
+    "calibrate.absent_frames": _whole(10, 1_000_000),
     "track.stride": COUNT,
     "track.fps": Range(0.1, 1000),
     "export.points": COUNT,

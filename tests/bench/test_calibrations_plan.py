@@ -49,9 +49,11 @@ def test_each_file_is_calibrated_in_place_after_the_scenes_are_rendered(
     load_script: Load,
 ) -> None:
     files = [Path("a.ckpt"), Path("b.ckpt")]
-    commands = load_script("bench/calibrations.py").list_commands(files, Path("r"), 400, 90)
+    commands = load_script("bench/calibrations.py").list_commands(files, Path("r"), 400, 240, 90)
     assert [words[0] for words in commands] == ["generate.py"] * 14 + ["calibrate.py"] * 2
     for file, words in zip(files, commands[-2:], strict=True):
         assert f"checkpoint={file.resolve()}" in words
-        assert {"frames=400", "overwrite=true", "data.split={val: 1.0}"} <= {*words}
+        assert {"frames=400", "absent_frames=240", "overwrite=true", "data.split={val: 1.0}"} <= {
+            *words
+        }
         assert not any(word.startswith("out=") for word in words)

@@ -81,10 +81,11 @@ def calibrate(job: Job) -> None:
     settings.limit_val = cfg.frames
     data = build_data(settings, cfg.console)
     data.setup("validate")
-    absent = [data.absent_dataset("val", cfg.frames)]
-    if cfg.absent is not None and len(absent[0]) < cfg.frames:
+    without = cfg.frames if cfg.absent_frames is None else cfg.absent_frames
+    absent = [data.absent_dataset("val", without)]
+    if cfg.absent is not None and len(absent[0]) < without:
         settings.root, settings.split = str(cfg.absent), {"val": 1.0}
-        more = cfg.frames - len(absent[0])
+        more = without - len(absent[0])
         absent.append(build_data(settings, cfg.console).absent_dataset("val", more))
     if sum(map(len, absent)) < FEWEST:
         raise UserError(
