@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from posefilter.confidence.verdicts import Costs
     from posefilter.errors import UserError
     from posefilter.estimator import Estimator
+    from posefilter.geometry.lens import undistort
     from posefilter.result import Result
     from posefilter.tracking.settings import TrackerSettings
     from posefilter.tracking.track import TrackResult
@@ -51,6 +52,7 @@ __all__ = [
     "figures",
     "load",
     "trust",
+    "undistort",
 ]
 
 _HOMES = {
@@ -71,6 +73,7 @@ _HOMES = {
     "figures": "figures",
     "load": "api",
     "trust": "cli.trust",
+    "undistort": "geometry.lens",
 }
 __getattr__ = import_lazily(__name__, _HOMES)
 

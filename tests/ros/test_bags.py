@@ -170,6 +170,47 @@ def test_detections_are_the_librarys_results(tmp_path: Path, capfd) -> None:
     assert sorted([size.x, size.y, size.z]) == pytest.approx([0.07, 0.16, 0.21], abs=0.015)
 
 
+def test_raw_images_are_rectified_as_the_camera_tells(tmp_path: Path, capfd) -> None:
+    rgb, depth, K = read_scene()
+    depth = depth.astype(np.uint16)
+    new = K.copy()
+    new[0, 0] *= 0.9
+    images = [
+        ("/rgb", IMAGE, 10, make_image(rgb, "rgb8", 10)),
+        ("/depth", IMAGE, 12, make_image(depth, "16UC1", 12)),
+    ]
+    lens = np.array([-0.3, 0.1, 0.001, 0.0, 0.0])
+    tell = {"d": lens, "p": np.concatenate([new, np.zeros((3, 1))], axis=1).reshape(12)}
+    camera = dataclasses.replace(make_info(K), **tell)
+    bag = write_bag(tmp_path / "in", [("/info", CAMERA_INFO, 0, camera), *images])
+    with BagReader(bag, TOPICS, 0.01, rectify=True) as reader:
+        (frame,) = reader.frames()
+        assert not reader.distorted
+    z = depth * np.float32(1e-3)
+    color, z = posefilter.undistort(rgb, z, K, lens, new_intrinsics=new)
+    assert np.array_equal(frame.rgb, color)
+    assert np.array_equal(frame.depth, z)
+    assert np.array_equal(frame.intrinsics, new)
+
+    typed = [str(bag), str(tmp_path / "out.mcap"), f"checkpoint={NAME}", *TYPED, *FEW]
+    assert run_command("convert_bag", HOME, typed) == 0
+    assert "rectify=true" in capfd.readouterr().out
+
+    turned = cv2.Rodrigues(np.array([0, 0.1, 0]))[0].reshape(9)
+    for number, (wrong, said) in enumerate(
+        (
+            ({"r": turned}, "stereo pair"),
+            ({"distortion_model": "spiral"}, "spiral is not one of"),
+            ({"k": np.zeros(9)}, "no matrix K"),
+        )
+    ):
+        own = dataclasses.replace(camera, **wrong)
+        bag = write_bag(tmp_path / str(number), [("/info", CAMERA_INFO, 0, own), *images])
+        reader = BagReader(bag, TOPICS, 0.01, rectify=True)
+        with reader, pytest.raises(UserError, match=said):
+            [*reader.frames()]
+
+
 def test_covariance_is_that_of_the_origin_and_turns_about_the_cameras_axes() -> None:
     torch.manual_seed(1)
     mean = torch.eye(4, dtype=torch.float64)

@@ -67,7 +67,7 @@ def bracketed(arguments: list[str]) -> list[str]:
     return [
         re.sub(
             # a glimpse's size is one number
-            r"^((?:\w+\.)*(?:intrinsics|camera)|(?:(?:\w+\.)*generate\.)?size)"
+            r"^((?:\w+\.)*(?:intrinsics|distortion|camera)|(?:(?:\w+\.)*generate\.)?size)"
             r"=([^\[\],]+(?:,[^\[\],]+)+)$",
             r"\1=[\2]",
             a,

@@ -33,7 +33,9 @@ def convert_bag(job: Job) -> None:
     if out.exists():
         raise UserError(f"out={out}: already exists; choose another")
     topics = Topics(str(cfg.color), str(cfg.depth), str(cfg.camera_info))
-    with BagReader(Path(str(cfg.bag)), topics, float(cfg.max_time_difference)) as reader:
+    with BagReader(
+        Path(str(cfg.bag)), topics, float(cfg.max_time_difference), cfg.rectify
+    ) as reader:
         settle(cfg.threads, cfg.seed)
         methods = methods_of(cfg.checkpoint, changes(cfg))
         estimator = Estimator(methods, costs=read_costs(cfg))
@@ -64,7 +66,8 @@ def convert_bag(job: Job) -> None:
             if cfg.copy_messages:
                 writer.copy(reader.messages())
     if reader.distorted:
-        said = "warning: the camera has a lens distortion, and images are taken as rectified ones"
+        said = "warning: the camera has a lens distortion, and images are taken as rectified ones; "
+        said += "if they are not: rectify=true"
         say(cfg.console, "distorted", said)
     if blank:
         say(cfg.console, "blank", f"warning: in {blank} of {images} images no pixel has depth")

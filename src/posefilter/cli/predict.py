@@ -27,6 +27,7 @@ from posefilter.figures.detections import Drawn, draw_detections
 from posefilter.figures.overlay import Shape
 from posefilter.figures.recording import record
 from posefilter.figures.view_data import collect_view_data
+from posefilter.geometry.lens import read_distortion, undistort
 from posefilter.images import check_images
 from posefilter.meshes.ycb import number_objects
 from posefilter.metrics.bop_results import PoseRow, choose_score, write_poses_csv
@@ -75,8 +76,7 @@ def predict_one(job: Job) -> list[Result]:
     costs, tolerance = read_costs(cfg), read_pose_tolerance(cfg.pose_tolerance)
     method = method_of(read_checkpoint(cfg.checkpoint), changes(cfg), lightning=False)
     estimator = Estimator([method], pose_tolerance=tolerance)
-    rgb, depth = read_photograph(cfg.rgb, cfg.depth, cfg.depth_scale)
-    K = read_intrinsics(cfg.intrinsics)
+    rgb, depth, K = read_inputs(cfg)
     shape = load_shape(open_shapes(cfg, [method.object_model.name]), method.object_model)
     images, _ = check_images(rgb, depth, K)
     (run,) = estimator.run(images, cfg.seed)
@@ -117,8 +117,7 @@ def predict_several(job: Job) -> list[Result]:
     costs, tolerance = read_costs(cfg), read_pose_tolerance(cfg.pose_tolerance)
     methods = methods_of(cfg.checkpoint, changes(cfg))
     estimator = Estimator(methods, costs=costs, pose_tolerance=tolerance)
-    rgb, depth = read_photograph(cfg.rgb, cfg.depth, cfg.depth_scale)
-    K = read_intrinsics(cfg.intrinsics)
+    rgb, depth, K = read_inputs(cfg)
     store = open_shapes(cfg, estimator.objects)
     if cfg.instances is None:
         (results,) = estimator.predict_batch(rgb[None], depth[None], K, seed=cfg.seed)
@@ -319,6 +318,24 @@ def describe_absent(
         "rgb": str(job.cfg.rgb),
         "depth": str(job.cfg.depth),
     }
+
+
+def read_inputs(cfg: DictConfig) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return color (H, W, 3) uint8, depth (H, W) [m] and K (3, 3) [px], of the rectified image.
+
+    Raises UserError where one is missing or they do not fit each other.
+    """
+    rgb, depth = read_photograph(cfg.rgb, cfg.depth, cfg.depth_scale)
+    K = read_intrinsics(cfg.intrinsics)
+    if cfg.distortion is not None:
+        rgb, depth = undistort(rgb, depth, K, parse_distortion(cfg.distortion))
+    return rgb, depth, K
+
+
+def parse_distortion(numbers: Any) -> tuple[float, ...]:
+    """Return the coefficients that were typed.  Raises UserError where they are none."""
+    parts = list(numbers) if isinstance(numbers, ListConfig | list) else str(numbers).split(",")
+    return read_distortion(parts)
 
 
 def read_photograph(rgb: str, depth: str, depth_scale: float) -> tuple[np.ndarray, np.ndarray]:

@@ -16,7 +16,7 @@ from posefilter.cli.console import JSON, ended, finite, say, show_table
 from posefilter.cli.job import Job
 from posefilter.cli.machine import settle
 from posefilter.cli.plain import resolve
-from posefilter.cli.predict import read_intrinsics
+from posefilter.cli.predict import parse_distortion, read_intrinsics
 from posefilter.cli.results import write_json
 from posefilter.cli.shapes import load_shape, open_shapes
 from posefilter.cli.track_log import POSES, TrackLog, check_unused
@@ -252,7 +252,9 @@ def open_videos(cfg: DictConfig, objects: Sequence[str]) -> tuple[Sequence[Video
     data = cfg.get("data")
     if cfg.frames:
         K, scale = read_intrinsics(cfg.intrinsics), float(cfg.depth_scale or _DEPTH_SCALE)
-        return [FolderVideo(Path(str(cfg.frames)), K, scale, cfg.stride)], lambda _: np.eye(4)
+        lens = None if cfg.distortion is None else parse_distortion(cfg.distortion)
+        video = FolderVideo(Path(str(cfg.frames)), K, scale, cfg.stride, lens)
+        return [video], lambda _: np.eye(4)
     names = list(objects)
     meshes = open_meshes(data.meshes, data.mesh_scale, data.source, names)
     options = resolve(data.options) or {}

@@ -14,6 +14,7 @@ from posefilter.data.readers.base import BaseReader
 from posefilter.data.readers.checked import read_checked
 from posefilter.data.readers.decode import expect_size, list_folder, read_color, read_depth
 from posefilter.errors import UserError
+from posefilter.geometry.lens import undistort
 
 _TIME = re.compile(r"\d+\.\d+|\d{10,}")
 _COLOR, _DEPTH = (".png", ".jpg", ".jpeg"), (".png", ".npy")
@@ -74,6 +75,7 @@ class FolderVideo(Video):
         intrinsics: (3, 3) camera matrix of all frames [px].
         depth_scale: Units of the depth images in a meter.
         stride: Take every so many frames.
+        distortion: Of the lens, see `undistort`; None: the pictures are rectified.
 
     Raises:
         UserError: A folder is missing or empty, or the pictures do not pair.
@@ -83,9 +85,15 @@ class FolderVideo(Video):
     objects: tuple[str, ...] | None = None
 
     def __init__(
-        self, folder: Path, intrinsics: np.ndarray, depth_scale: float, stride: int = 1
+        self,
+        folder: Path,
+        intrinsics: np.ndarray,
+        depth_scale: float,
+        stride: int = 1,
+        distortion: tuple[float, ...] | None = None,
     ) -> None:
         self.name, self._K, self._scale = folder.name, intrinsics, depth_scale
+        self._distortion = distortion
         self.ids: dict[str, int] = {}
         color, numbers = _list_pictures(folder, "rgb", _COLOR)
         depth, _ = _list_pictures(folder, "depth", _DEPTH)
@@ -116,6 +124,8 @@ class FolderVideo(Video):
         number, color, depth = self._frames[index]
         rgb, z = read_color(color), read_depth(depth, self._scale)
         expect_size(depth, z, rgb.shape[0], rgb.shape[1], color.name)
+        if self._distortion is not None:
+            rgb, z = undistort(rgb, z, self._K, self._distortion)
         return VideoFrame(color.stem, number, rgb, z, self._K, {})
 
 

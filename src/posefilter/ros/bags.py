@@ -21,6 +21,7 @@ from posefilter.ros.messages import (
     decode_intrinsics,
     is_distorted,
     open_types,
+    rectify,
     stamp_of,
 )
 
@@ -53,15 +54,17 @@ class BagReader:
         path: A bag's folder, or its .mcap or .db3 file.
         topics: Where its images are.
         tolerance: Largest difference between the times of color and depth [s].
+        rectify: Whether to undo the lens distortion that the camera tells.
 
     Raises:
         UserError: It cannot be read, or has no such topics.
     """
 
-    def __init__(self, path: Path, topics: Topics, tolerance: float) -> None:
+    def __init__(self, path: Path, topics: Topics, tolerance: float, rectify: bool = False) -> None:
         from rosbags.rosbag2 import Reader
 
         self.path, self.topics, self.tolerance = path, topics, int(tolerance * 1e9)
+        self.rectify = rectify
         self.distorted = False  # whether a camera had a lens distortion that is not undone
         self.unpaired = 0  # color images without depth
         self.early = 0  # color images before the camera is known
@@ -133,7 +136,7 @@ class BagReader:
                 if camera is None:
                     self._drop_early(colors, depths)
                 camera = message
-                self.distorted |= is_distorted(message)
+                self.distorted |= is_distorted(message) and not self.rectify
                 continue
             own, other = (
                 (colors, depths) if connection.topic == self.topics.color else (depths, colors)
@@ -183,6 +186,8 @@ class BagReader:
                 "name the camera's own topic"
             )
         K = decode_intrinsics(camera, self.topics.camera_info)
+        if self.rectify:
+            rgb, z = rectify(rgb, z, camera, self.topics.camera_info)
         return BagFrame(rgb, z, K, color[2].header, color[1])
 
 

@@ -13,6 +13,7 @@ import numpy as np
 
 from posefilter.data.readers.decode import decode_image
 from posefilter.errors import UserError
+from posefilter.geometry.lens import undistort
 from posefilter.limits import MOST_SIDE
 
 IMAGE, COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
@@ -32,6 +33,7 @@ _VISION = {
     ),
     "Detection3DArray": "std_msgs/Header header\nvision_msgs/Detection3D[] detections",
 }
+_MODELS = ("plumb_bob", "rational_polynomial", "equidistant")  # of distortion
 _CHANNELS = {"rgb8": 3, "bgr8": 3, "rgba8": 4, "bgra8": 4, "mono8": 1, "8UC3": 3}
 _TO_RGB = {
     "bgr8": cv2.COLOR_BGR2RGB,
@@ -161,6 +163,34 @@ def decode_intrinsics(message: Any, topic: str = "camera_info") -> np.ndarray:
     if not P[0, 0] > 0 and not K[0, 0] > 0:  # so a driver says it
         raise UserError(f"camera_info={topic}: the camera is not calibrated (K and P are 0)")
     return P if P[0, 0] > 0 else K
+
+
+def rectify(
+    rgb: np.ndarray, depth: np.ndarray, message: Any, topic: str = "camera_info"
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return raw images without the lens distortion that a CameraInfo tells, as of the camera that
+    `decode_intrinsics` returns.
+
+    Raises:
+        UserError: The camera is not calibrated, is of a stereo pair, or has another distortion.
+    """
+    wanted = decode_intrinsics(message, topic)
+    K = np.asarray(message.k, dtype=np.float64).reshape(3, 3)
+    R = np.asarray(message.r, dtype=np.float64).reshape(3, 3)
+    if not K[0, 0] > 0:
+        raise UserError(f"camera_info={topic}: has no matrix K of raw images; rectify=false?")
+    if R.any() and not np.allclose(R, np.eye(3), atol=1e-6):
+        raise UserError(
+            f"camera_info={topic}: turns rectified images (R), as of a stereo pair, which is not "
+            "supported; have stereo_image_proc rectify them"
+        )
+    model = str(message.distortion_model)
+    if model and model not in _MODELS:
+        raise UserError(f"camera_info={topic}: distortion_model={model} is not one of {_MODELS}")
+    if not is_distorted(message) and np.allclose(K, wanted):
+        return rgb, depth
+    numbers = np.asarray(message.d, dtype=np.float64) if len(message.d) else np.zeros(4)
+    return undistort(rgb, depth, K, numbers, model == "equidistant", wanted)
 
 
 def is_distorted(message: Any) -> bool:

@@ -1,0 +1,101 @@
+"""Lens distortion, undone: images as a camera of the same place, without it, would take them."""
+
+from collections.abc import Sequence
+from functools import lru_cache
+from typing import Any
+
+import cv2
+import numpy as np
+
+from posefilter.errors import UserError
+
+_COUNTS = (4, 5, 8, 12, 14)  # of coefficients that OpenCV's model takes
+_COUNT_FISHEYE = 4
+
+
+def undistort(
+    rgb: np.ndarray,
+    depth: np.ndarray,
+    intrinsics: Any,
+    distortion: Any,
+    fisheye: bool = False,
+    new_intrinsics: Any = None,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return color and depth without the distortion of the lens; what no pixel shows is 0.
+
+    The estimator takes images of a pinhole camera. Those of drivers that rectify, and of datasets,
+    are; raw images of a wide lens are not, and a pose in a corner would be off by centimeters.
+    Depth is that of the nearest pixel, since a mean of two surfaces is none.
+
+    Args:
+        rgb: Color (H, W, 3), any type.
+        depth: z-depth (H, W), registered to the color: with its distortion.
+        intrinsics: Camera matrix (3, 3) of the raw images [px].
+        distortion: Coefficients in the order of OpenCV and ROS: k1, k2, p1, p2, then k3, then k4 to
+            k6, and so on, so 4, 5, 8, 12 or 14 (ROS: plumb_bob, rational_polynomial); of a fisheye
+            lens k1 to k4 (ROS: equidistant).
+        fisheye: Whether they are of a fisheye lens (Kannala and Brandt 2006).
+        new_intrinsics: Camera matrix (3, 3) that the returned images shall have, `P[:, :3]` of a
+            ROS CameraInfo; None: `intrinsics`.
+
+    Returns:
+        Color and depth, of the same shapes and types.
+
+    Raises:
+        UserError: There are not as many coefficients, or they are no numbers; or the shapes differ.
+    """
+    height, width = depth.shape[:2]
+    if rgb.shape[:2] != (height, width):
+        raise UserError(f"depth: has shape {depth.shape}, but rgb {rgb.shape}")
+    K = _read_matrix(intrinsics)
+    wanted = K if new_intrinsics is None else _read_matrix(new_intrinsics)
+    maps = _find_maps(K, wanted, read_distortion(distortion, fisheye), fisheye, width, height)
+    color, z = (np.ascontiguousarray(one) for one in (rgb, depth))
+    return (
+        cv2.remap(color, *maps, cv2.INTER_LINEAR),
+        cv2.remap(z, *maps, cv2.INTER_NEAREST),
+    )
+
+
+def read_distortion(numbers: Any, fisheye: bool = False) -> tuple[float, ...]:
+    """Return the coefficients of a lens distortion.
+
+    Raises:
+        UserError: There are not as many as a model has, or one is no number.
+    """
+    counts = (_COUNT_FISHEYE,) if fisheye else _COUNTS
+    try:
+        array = np.asarray(numbers, dtype=np.float64).ravel()
+    except (TypeError, ValueError) as error:
+        raise UserError(f"distortion={numbers}: are no numbers") from error
+    if len(array) not in counts or not np.isfinite(array).all():
+        known = " or ".join(map(str, counts))
+        raise UserError(
+            f"distortion={list(array)}: expected {known} finite coefficients, "
+            f"{'k1 to k4' if fisheye else 'k1,k2,p1,p2[,k3[,k4,k5,k6...]]'}"
+        )
+    return tuple(array.tolist())
+
+
+def _read_matrix(intrinsics: Any) -> tuple[float, ...]:
+    """Return the nine numbers of a camera matrix."""
+    matrix = np.asarray(intrinsics, dtype=np.float64)
+    if matrix.shape != (3, 3):
+        raise UserError(f"intrinsics: have shape {matrix.shape}; expected a camera matrix (3, 3)")
+    return tuple(matrix.ravel().tolist())
+
+
+@lru_cache(maxsize=4)  # a video's frames have the same
+def _find_maps(
+    K: Sequence[float],
+    wanted: Sequence[float],
+    coefficients: Sequence[float],
+    fisheye: bool,
+    width: int,
+    height: int,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return where each pixel of the new image is in the raw one, (H, W) of x and of y [px]."""
+    own, new = (np.reshape(matrix, (3, 3)) for matrix in (K, wanted))
+    find = cv2.fisheye.initUndistortRectifyMap if fisheye else cv2.initUndistortRectifyMap
+    maps = find(own, np.array(coefficients), np.eye(3), new, (width, height), cv2.CV_32FC1)
+    return maps[0], maps[1]
