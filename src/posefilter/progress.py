@@ -1,6 +1,6 @@
 """Progress bars that say nothing at all where nobody watches."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from typing import TypeVar
 
@@ -26,10 +26,10 @@ def bars(
         yield progress
 
 
-def watched(items: Sequence[_Item], what: str, shown: bool) -> Iterator[_Item]:
-    """Yield items under a bar that is gone when they are done."""
+def watched(items: Iterable[_Item], count: int, what: str, shown: bool) -> Iterator[_Item]:
+    """Yield items, `count` of them, under a bar that is gone when they are done."""
     with bars(shown=shown, transient=True) as progress:
-        task = progress.add_task(what, total=len(items))
+        task = progress.add_task(what, total=count)
         for item in items:
             yield item
             progress.advance(task)

@@ -31,7 +31,7 @@ def test_bars_print_nothing_where_there_is_no_terminal(capsys: pytest.CaptureFix
     for shown in (True, False):
         with bars(shown=shown) as bar:
             bar.advance(bar.add_task("x", total=2))
-    assert list(watched([1, 2, 3], "x", True)) == [1, 2, 3]
+    assert list(watched([1, 2, 3], 3, "x", True)) == [1, 2, 3]
     assert capsys.readouterr().out == ""
     with Progress():
         pass

@@ -132,7 +132,7 @@ def _check_object(
     fits: list[Fit] = []
     tiles: list[np.ndarray] = []
     suspects: list[Suspect] = []
-    for i in watched(chosen, name, progress):
+    for i in watched(chosen, len(chosen), name, progress):
         flaw = ""
         try:
             try:

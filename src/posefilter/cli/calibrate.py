@@ -138,10 +138,11 @@ def collect_frames(
     """
     values, there, errors, beliefs = [], [], [], []
     parts = [(one, True) for one in present] + [(one, False) for one in absent]
-    batches = [
-        (batch, is_there) for one, is_there in parts for batch in make_loader(one, _BATCH, 0)
-    ]
-    for number, (batch, is_there) in enumerate(watched(batches, "estimating", shown)):
+    loaders = [(make_loader(one, _BATCH, 0), is_there) for one, is_there in parts]
+    count = sum(len(loader) for loader, _ in loaders)
+    # batch after batch: all of a thousand frames would take gigabytes
+    batches = ((batch, is_there) for loader, is_there in loaders for batch in loader)
+    for number, (batch, is_there) in enumerate(watched(batches, count, "estimating", shown)):
         truth = batch.camera_from_object
         seen = Batch(*(x.to(method.device) for x in hide_annotation(batch)))
         with torch.no_grad():
