@@ -14,7 +14,13 @@ from posefilter.confidence.apparent_size import ApparentSize
 from posefilter.confidence.calibration import Assessment, Calibration
 from posefilter.confidence.conformal import Conformal
 from posefilter.confidence.tolerance import RIGHT, PoseTolerance
-from posefilter.confidence.verdicts import Costs, Verdict, apply_prior, decide
+from posefilter.confidence.verdicts import (
+    Costs,
+    Verdict,
+    apply_prior,
+    decide,
+    describe_probability,
+)
 from posefilter.errors import UserError
 from posefilter.models.base import PoseEstimator
 from posefilter.plausibility import find_warnings
@@ -237,18 +243,20 @@ class Result:
         """Return the verdict in a few words: `003_cracker_box: found, probability 0.97`."""
         if self.blank:
             return f"{self.object}: unsure, the image cannot be judged"
-        if self.verdict is None:
+        if self.probability is None or self.presence is None:
             return f"{self.object}, score {self.score:.2f}"
+        there = f"{describe_probability(self.presence)} that it is there"
         if self.verdict == "absent":
-            return f"{self.object}: absent, probability {self.presence:.2f} that it is there"
+            return f"{self.object}: absent, probability {there}"
         if self.verdict == "unsure" and self.wrong_size:
             return f"{self.object}: unsure, appears {self.apparent_size:.2f} times its size"
-        said, tolerance = f"probability {self.probability:.2f}", self.pose_tolerance
+        said, tolerance = describe_probability(self.probability), self.pose_tolerance
         if tolerance is not None:
-            said = f"probability {self.probability_within(tolerance):.2f} {tolerance.describe()}"
+            within = describe_probability(self.probability_within(tolerance))
+            said = f"{within} {tolerance.describe()}"
         if self.verdict == "unsure":
-            return f"{self.object}: unsure, {said}, {self.presence:.2f} that it is there"
-        return f"{self.object}: found, {said}"
+            return f"{self.object}: unsure, probability {said}, {there}"
+        return f"{self.object}: found, probability {said}"
 
     def draw_belief(self, rgb: Any, intrinsics: Any) -> np.ndarray:
         """Draw the belief: rotations on a map, centers on the image, marginals.

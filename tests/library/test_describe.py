@@ -19,8 +19,15 @@ from posefilter.result import Result
 def test_an_unsure_answer_says_both_whether_it_is_there_and_whether_it_is_right(
     verdict: str | None, words: str
 ) -> None:
-    one = answer(verdict)
+    one = answer(verdict) if verdict else answer(None, probability=None)
     assert Result.describe(one) == words  # type: ignore[arg-type]
+
+
+def test_no_probability_is_told_as_certain() -> None:
+    """Some hundred calibration frames do not tell so much."""
+    sure, none = answer("found", probability=0.9992), answer("absent", presence=0.002)
+    assert Result.describe(sure) == "box: found, probability 0.99"  # type: ignore[arg-type]
+    assert Result.describe(none) == "box: absent, probability 0.01 that it is there"  # type: ignore[arg-type]
 
 
 NOTHING = {"wrong_size": False, "blank": "", "pose_tolerance": None}

@@ -114,7 +114,7 @@ def test_an_absent_object_gets_no_pose_and_status_1(
     typed = [f"checkpoint={nothing}", *photograph(tiny_scenes), f"out={tmp_path / 'a'}"]
     assert run_command("predict", HOME, typed) == 1
     out, err = capfd.readouterr()
-    assert err.splitlines() == ["predict: carton: absent, probability 0.00 that it is there"]
+    assert err.splitlines() == ["predict: carton: absent, probability 0.01 that it is there"]
     assert json.loads(out.splitlines()[-1])["verdict"] == "absent"
     told = json.loads((tmp_path / "a" / "pose.json").read_text())
     assert told["verdict"] == "absent"

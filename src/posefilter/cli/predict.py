@@ -18,7 +18,7 @@ from posefilter.cli.machine import settle
 from posefilter.cli.results import write_json
 from posefilter.cli.shapes import load_shape, open_shapes
 from posefilter.confidence.tolerance import PoseTolerance, read_pose_tolerance
-from posefilter.confidence.verdicts import Costs
+from posefilter.confidence.verdicts import Costs, describe_probability
 from posefilter.data.readers.decode import holds_meters, read_color, read_depth
 from posefilter.errors import NotThere, UserError
 from posefilter.estimator import Estimator
@@ -173,13 +173,14 @@ def read_costs(cfg: DictConfig) -> Costs:
 def mark_result(result: Result, shape: Shape) -> Drawn:
     """Return how a result is drawn among several: its line, its tag, its name in the legend."""
     unsure = result.verdict == "unsure"
-    if result.probability is None:
-        said = f"{result.score:.1f}"
+    if result.probability is None or result.presence is None:
+        said, tag = f"{result.score:.1f}", ""
     else:
-        there = f"unsure {result.probability:.2f}, there {result.presence:.2f}"
-        said = there if unsure else f"{result.probability:.2f}"
+        said = describe_probability(result.probability)
+        tag = f"{result.object} {said}"
+        if unsure:
+            said = f"unsure {said}, there {describe_probability(result.presence)}"
     known = f"{said}, implausible" if result.warnings else said
-    tag = "" if result.probability is None else f"{result.object} {result.probability:.2f}"
     return Drawn(f"{result.object} ({known})", result.pose, shape, tag, unsure)
 
 
@@ -193,7 +194,8 @@ def print_result(result: Result) -> None:
         at = "" if result.verdict == "absent" else f", at {place} mm"
         print(f"{result.describe()}{at}, {result.seconds:.2f} s")
     if is_found_by_surface(result):
-        said = f"probability {result.probability_within(_SURFACE):.2f} {_SURFACE.describe()}"
+        within = describe_probability(result.probability_within(_SURFACE))
+        said = f"probability {within} {_SURFACE.describe()}"
         how = f"pose_tolerance.add_s={_SURFACE.add_s}"
         print(f"{said}: its place is surer than its rotation ({how})")
     if result.verdict != "absent":

@@ -67,6 +67,13 @@ def decide(presence: float, probability: float, costs: Costs | None = None) -> V
     return min(expected, key=lambda verdict: expected[verdict])
 
 
+def describe_probability(probability: float) -> str:
+    """Return a probability in two digits, none nearer to 0 or 1 than 0.01: some hundred calibration
+    frames do not tell more.
+    """
+    return f"{min(max(probability, 0.01), 0.99):.2f}"
+
+
 def apply_prior(presence: float, probability: float, prior: float) -> tuple[float, float]:
     """Return presence and probability for images that show the object more or less often than not.
 
