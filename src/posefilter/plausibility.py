@@ -8,6 +8,7 @@ _SMALLEST = 16.0  # [px] the diameter, below which nothing on an object can be t
 _LARGEST = 3.0  # times the image's longer side
 _FEWEST = 0.05  # of the pixels have depth
 _NEAREST = 0.2  # [m] the median depth; few depth cameras measure nearer
+_FARTHEST = 6.0  # [m] likewise; beyond, most measure little, and objects for a hand are some pixels
 _OFF = 0.24  # of the image's size: principal points farther from its middle are those of a part
 
 
@@ -42,6 +43,11 @@ def find_warnings(
     if median < _NEAREST:
         found.append(
             f"the median depth is {median:.2g} m, nearer than most depth cameras measure: is the "
+            "depth in the right units (depth_scale)?"
+        )
+    elif _FARTHEST < median < np.inf:
+        found.append(
+            f"the median depth is {median:.2g} m, farther than most depth cameras measure: is the "
             "depth in the right units (depth_scale)?"
         )
     off = np.abs(intrinsics[:2, 2] / (width, height) - 0.5)

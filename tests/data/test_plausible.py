@@ -378,6 +378,15 @@ def test_depth_nearer_than_cameras_measure_is_told(tmp_path, scale, told):
     )
 
 
+def test_a_median_depth_beyond_what_cameras_measure_is_told():
+    model = object_model(MeshStore("builtin").load("carton"))
+    where = np.eye(4)
+    where[2, 3] = 0.8
+    for median, told in ((8.0, True), (3.0, False)):
+        found = find_warnings(where, model, np.full((100, 100), median), K)
+        assert any(f"the median depth is {median:.2g} m, farther" in one for one in found) is told
+
+
 def test_a_score_that_is_no_number_is_refused(tmp_path):
     row = "0,0,1,nan,1 0 0 0 1 0 0 0 1,0 0 500,1\n"
     (tmp_path / "poses.csv").write_text("scene_id,im_id,obj_id,score,R,t,time\n" + row)
