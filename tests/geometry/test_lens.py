@@ -10,12 +10,15 @@ import torch
 from tests.library.test_estimator import FEW, NAME, ONE_MODE, read_scene
 
 import posefilter
-from posefilter.cli.command import run_command
+from posefilter.cli.arguments import bracketed
+from posefilter.cli.command import compose_job, run_command
+from posefilter.cli.track import open_videos
 from posefilter.data.sequences import FolderVideo
 from posefilter.errors import UserError
 from posefilter.geometry.lens import undistort
 from posefilter.metrics.errors import add
 
+HOME = Path(__file__).parents[2]
 BROWN = (-0.35, 0.12, 0.001, -0.002, 0.02)
 FISHEYE = (-0.05, 0.01, -0.003, 0.001)
 K = np.array([[260.0, 0, 163.0], [0, 255.0, 118.0], [0, 0, 1]])
@@ -114,5 +117,40 @@ def test_files_are_rectified_by_commands(tmp_path: Path) -> None:
 def test_wrong_coefficients_are_refused(numbers: tuple, fisheye: bool, said: str) -> None:
     with pytest.raises(UserError, match=said):
         undistort(np.zeros((4, 4, 3)), np.zeros((4, 4)), K, numbers, fisheye)
+
+
+def test_images_that_cannot_be_resampled_are_refused() -> None:
+    rgb, depth = np.zeros((4, 5, 3), np.uint8), np.zeros((4, 5), np.float32)
     with pytest.raises(UserError, match="camera matrix"):
-        undistort(np.zeros((4, 4, 3)), np.zeros((4, 4)), K[0], BROWN)
+        undistort(rgb, depth, K[0], BROWN)
+    with pytest.raises(UserError, match="but rgb"):
+        undistort(rgb, depth[:3], K, BROWN)
+    with pytest.raises(UserError, match="float16"):
+        undistort(rgb, depth.astype(np.float16), K, BROWN)
+
+
+@pytest.mark.parametrize("count", [4, 5, 8, 12, 14])
+def test_what_no_pixel_shows_is_empty(count: int) -> None:
+    rgb, depth = np.full((240, 320, 3), 200, np.uint8), np.full((240, 320), 0.7, np.float32)
+    color, z = undistort(rgb, depth, K, (0.4, 0.1, 0, 0, *[0.0] * 10)[:count])
+    assert z[0, 0] == z[-1, -1] == 0  # a pincushion, whose corners the image does not hold
+    assert not color[0, 0].any()
+    assert z[120, 160] == np.float32(0.7)
+
+
+def test_a_video_of_a_folder_is_rectified_by_the_command(tmp_path: Path, capfd) -> None:
+    for name in ("rgb", "depth"):
+        (tmp_path / name).mkdir()
+        image = np.full((240, 320), *((900, np.uint16) if name == "depth" else (90, np.uint8)))
+        assert cv2.imwrite(str(tmp_path / name / "0.png"), image)
+    typed = [f"frames={tmp_path}", "intrinsics=260,255,163,118", "depth_scale=1000"]
+    lens = "distortion=0.4,0.1,0,0"
+    found = []
+    for words in (typed, [*typed, lens]):
+        cfg = compose_job("track", HOME / "conf", bracketed(words), tmp_path).cfg
+        ((video,), _) = open_videos(cfg, ["box"])
+        found.append(next(iter(video)).depth[0, 0])
+    assert found == [np.float32(0.9), 0]
+    typed = [f"checkpoint={NAME}", "data=ycb_video", f"data.root={tmp_path}", lens]
+    assert run_command("track", HOME, [*typed, f"out={tmp_path / 'out'}"]) == 2
+    assert "only valid with frames=DIR" in capfd.readouterr().err

@@ -195,6 +195,18 @@ def test_raw_images_are_rectified_as_the_camera_tells(tmp_path: Path, capfd) -> 
     typed = [str(bag), str(tmp_path / "out.mcap"), f"checkpoint={NAME}", *TYPED, *FEW]
     assert run_command("convert_bag", HOME, typed) == 0
     assert "rectify=true" in capfd.readouterr().out
+    typed[1] = str(tmp_path / "rectified.mcap")
+    assert run_command("convert_bag", HOME, [*typed, "rectify=true"]) == 0
+    assert "lens distortion" not in capfd.readouterr().out
+
+    fisheye = {"distortion_model": "equidistant", "d": lens[:4]}
+    own = dataclasses.replace(camera, **fisheye)
+    bag = write_bag(tmp_path / "fisheye", [("/info", CAMERA_INFO, 0, own), *images])
+    with BagReader(bag, TOPICS, 0.01, rectify=True) as reader:
+        (frame,) = reader.frames()
+    z = depth * np.float32(1e-3)
+    color, _ = posefilter.undistort(rgb, z, K, lens[:4], fisheye=True, new_intrinsics=new)
+    assert np.array_equal(frame.rgb, color)
 
     turned = cv2.Rodrigues(np.array([0, 0.1, 0]))[0].reshape(9)
     for number, (wrong, said) in enumerate(

@@ -23,7 +23,7 @@ _FOLDERS = {
     "track": ("frames", "meshes", "data.root", "data.meshes"),
     "train": ("data.root", "data.meshes"),
 }
-_SWITCHES = {"calibrate": ("overwrite",), "convert_bag": ("track", "copy_messages")}
+_SWITCHES = {"calibrate": ("overwrite",), "convert_bag": ("rectify", "track", "copy_messages")}
 # by the class of a logger: the package that it needs, which is an extra of ours by the same name
 _LOGGERS = {
     "lightning.pytorch.loggers.MLFlowLogger": "mlflow",
@@ -122,6 +122,8 @@ def _check_video(cfg: DictConfig) -> None:
             raise UserError(
                 f"{key}: only valid with frames=DIR; a dataset has its own {key}, leave it out"
             )
+    if data and cfg.distortion is not None:
+        raise UserError("distortion: only valid with frames=DIR; a dataset's images are rectified")
     if cfg.frames and cfg.intrinsics is None:
         raise UserError("intrinsics: is missing; frames=DIR needs intrinsics=fx,fy,cx,cy [px]")
     if data and data.root is None:

@@ -42,7 +42,8 @@ def undistort(
         Color and depth, of the same shapes and types.
 
     Raises:
-        UserError: There are not as many coefficients, or they are no numbers; or the shapes differ.
+        UserError: There are not as many coefficients, or they are no numbers; or the shapes differ,
+            or a type cannot be resampled.
     """
     height, width = depth.shape[:2]
     if rgb.shape[:2] != (height, width):
@@ -51,10 +52,16 @@ def undistort(
     wanted = K if new_intrinsics is None else _read_matrix(new_intrinsics)
     maps = _find_maps(K, wanted, read_distortion(distortion, fisheye), fisheye, width, height)
     color, z = (np.ascontiguousarray(one) for one in (rgb, depth))
-    return (
-        cv2.remap(color, *maps, cv2.INTER_LINEAR),
-        cv2.remap(z, *maps, cv2.INTER_NEAREST),
-    )
+    try:
+        return (
+            cv2.remap(color, *maps, cv2.INTER_LINEAR),
+            cv2.remap(z, *maps, cv2.INTER_NEAREST),
+        )
+    except cv2.error as error:
+        raise UserError(
+            f"rgb, depth: types {color.dtype} and {z.dtype} of {width}x{height} pixels cannot be "
+            "resampled; uint8 or float32, and uint16 or float32, can"
+        ) from error
 
 
 def read_distortion(numbers: Any, fisheye: bool = False) -> tuple[float, ...]:
