@@ -28,8 +28,8 @@ def undistort(
     Depth is that of the nearest pixel, since a mean of two surfaces is none.
 
     Args:
-        rgb: Color (H, W, 3), any type.
-        depth: z-depth (H, W), registered to the color: with its distortion.
+        rgb: Color (H, W, 3), uint8 or float32.
+        depth: z-depth (H, W), uint16 or float, registered to the color: with its distortion.
         intrinsics: Camera matrix (3, 3) of the raw images [px].
         distortion: Coefficients in the order of OpenCV and ROS: k1, k2, p1, p2, then k3, then k4 to
             k6, and so on, so 4, 5, 8, 12 or 14 (ROS: plumb_bob, rational_polynomial); of a fisheye
