@@ -100,6 +100,11 @@ def test_files_are_rectified_by_commands(tmp_path: Path) -> None:
     assert np.allclose(told["camera_from_object"], wanted.pose, atol=1e-6)
     assert run_command("predict", arguments=[*typed, "distortion=0.1,0.2"]) == 2
 
+    several = [f"checkpoint=[{NAME},025_mug]", f"out={tmp_path / 'several'}"]
+    assert run_command("predict", arguments=[*typed, lens, *several]) < 2
+    first, _ = json.loads((tmp_path / "several" / "poses.json").read_text())
+    assert np.allclose(first["camera_from_object"], wanted.pose, atol=1e-6)
+
     (frame,) = FolderVideo(tmp_path, K, 1000.0, distortion=numbers)
     assert np.array_equal(frame.rgb, given[0])
     assert np.array_equal(frame.depth, given[1])

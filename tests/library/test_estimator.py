@@ -231,6 +231,18 @@ def test_the_belief_of_an_instance_is_as_wide_as_errors_are(
     assert 0.7 < as_instance.translation / sure.translation < 1.4  # the particles' is 1.7 times it
 
 
+def test_instances_have_the_calibration_of_their_own_object(
+    estimator: posefilter.Estimator,
+) -> None:
+    images = read_scene(0, ONE_MODE)
+    (alone,) = estimator.predict(*images, instances=1)
+    other = posefilter.load("025_mug", device="cpu")
+    both = posefilter.Estimator([*other.methods, *estimator.methods], "cpu")
+    (found,) = [one for one in both.predict(*images, instances=1) if one.object == NAME]
+    assert found.probability == pytest.approx(alone.probability, abs=1e-6)
+    assert np.allclose(found.belief.samples, alone.belief.samples, atol=1e-6)
+
+
 def test_tensors_and_floats_are_the_same_image(small: posefilter.Estimator) -> None:
     rgb, depth, K = read_scene()
     arrays = small.predict(rgb, depth, K)

@@ -208,6 +208,16 @@ def test_raw_images_are_rectified_as_the_camera_tells(tmp_path: Path, capfd) -> 
     color, _ = posefilter.undistort(rgb, z, K, lens[:4], fisheye=True, new_intrinsics=new)
     assert np.array_equal(frame.rgb, color)
 
+    # no coefficients and no rotation told, but another matrix: zoomed, as ROS has it
+    own = dataclasses.replace(camera, d=np.zeros(0), r=np.zeros(9))
+    bag = write_bag(tmp_path / "zoomed", [("/info", CAMERA_INFO, 0, own), *images])
+    with BagReader(bag, TOPICS, 0.01, rectify=True) as reader:
+        (frame,) = reader.frames()
+    color, _ = posefilter.undistort(rgb, z, K, (0.0,) * 4, new_intrinsics=new)
+    assert np.array_equal(frame.rgb, color)
+    assert not np.array_equal(frame.rgb, rgb)
+    assert np.array_equal(frame.intrinsics, new)
+
     turned = cv2.Rodrigues(np.array([0, 0.1, 0]))[0].reshape(9)
     for number, (wrong, said) in enumerate(
         (

@@ -209,6 +209,25 @@ def test_a_tracks_belief_is_calibrated_where_it_was_measured() -> None:
         assert 0.25 < widths[0] / widths[1] < 0.75  # e^-1 sqrt(5 / 3) = 0.47, and the prior
 
 
+def test_a_tracks_draws_lie_about_the_smoothed_pose() -> None:
+    toy, estimator = make_toy()
+    toy.calibration = Calibration(
+        ("score",), (-5.0,), (2.0,), Logistic((3.0,), 0.0), Logistic((3.0,), 0.0),
+        {"right": 20, "wrong": 0, "absent": 20}, "toy", {}, belief_scale=BeliefScale(-2.0, 0.0),
+    )  # fmt: skip
+    tracker = posefilter.Tracker(estimator, TrackerSettings(smoothing_noise=0.02))
+    toy.truth = still = walk_pose(1)[0]
+    for _ in range(6):
+        tracker.update(RGB, DEPTH, K)
+    toy.truth = SPACE.move(still, torch.tensor([0.008, 0, 0, 0, 0, 0]))
+    result = tracker.update(RGB, DEPTH, K)
+    assert result.status == "tracked"
+    middle = np.median(result.belief.samples[: result.belief.draws], axis=0)
+    behind = np.linalg.norm(result.pose[:3, 3] - toy.truth[:3, 3].double().numpy())
+    assert behind > 0.004
+    assert np.linalg.norm(middle[:3, 3] - result.pose[:3, 3]) < 0.25 * behind
+
+
 def test_a_tracks_verdict_goes_by_the_costs_and_the_tolerance_of_its_estimator() -> None:
     toy, _ = make_toy()
     toy.calibration = Calibration(
