@@ -82,11 +82,9 @@ class PoseNode(Node):
     def answer(self, color: Image, depth: Image, camera: CameraInfo) -> None:
         """Publish what one image shows."""
         try:
-            results = self.tracker.update_all(
-                decode_color(color, "color"),
-                decode_depth(depth, "depth"),
-                decode_intrinsics(camera, "camera_info"),
-            )
+            rgb = decode_color(color, "color")
+            intrinsics = decode_intrinsics(camera, rgb.shape[:2])
+            results = self.tracker.update_all(rgb, decode_depth(depth, "depth"), intrinsics)
         except posefilter.UserError as error:  # of this image; the next may be as it should be
             self.get_logger().error(str(error), throttle_duration_sec=_SILENCE)
             return

@@ -37,6 +37,7 @@ from posefilter.ros.messages import (
     decode_intrinsics,
     make_message,
     open_types,
+    rectify,
 )
 
 HOME = Path(__file__).parents[2]
@@ -282,7 +283,7 @@ def test_images_are_read_in_every_layout() -> None:
     message = make_image(big, "16UC1", is_bigendian=1)
     np.testing.assert_allclose(decode_depth(message, "/d"), kept[:1], rtol=1e-6)
     K = np.array([[500.0, 0, 320], [0, 510, 240], [0, 0, 1]])
-    np.testing.assert_array_equal(decode_intrinsics(make_info(K)), K)
+    np.testing.assert_array_equal(decode_intrinsics(make_info(K), (480, 640)), K)
 
 
 def make_png(width: int, height: int) -> bytes:
@@ -335,7 +336,49 @@ def test_compressed_depth_that_cannot_be_read_is_named(form: str, data: bytes, t
 
 def test_a_camera_that_is_not_calibrated_is_named() -> None:
     with pytest.raises(UserError, match="camera_info=/info: the camera is not calibrated"):
-        decode_intrinsics(make_info(np.zeros((3, 3))), "/info")
+        decode_intrinsics(make_info(np.zeros((3, 3))), (480, 640), "/info")
+
+
+@pytest.mark.parametrize("told", [True, False])
+def test_a_region_of_interest_and_binning_move_the_matrix(told: bool) -> None:
+    """The matrices of a CameraInfo are of the whole sensor, those of an image of its part."""
+    K = np.array([[600.0, 0, 330], [0, 620, 250], [0, 0, 1]])
+    info = make_info(K, *((640, 480) if told else ()))
+    point = np.array([0.05, 0.03, 0.8])
+    whole = (K @ point / point[2])[:2]
+    info.roi.x_offset, info.roi.y_offset, info.roi.width, info.roi.height = 100, 60, 320, 240
+    for binning, size in (((0, 0), (240, 320)), ((2, 4), (60, 160))):
+        info.binning_x, info.binning_y = binning
+        part = decode_intrinsics(info, size)
+        seen = (part @ point / point[2])[:2]
+        np.testing.assert_allclose(seen, (whole - [100, 60]) / np.maximum(binning, 1))
+        assert part[2].tolist() == [0, 0, 1]
+        with pytest.raises(UserError, match=f"is of images of {size[1]}x{size[0]} pixels"):
+            decode_intrinsics(info, (size[0], size[1] + 1))
+    # a driver that tells the size and the matrix of the image itself, and the binning beside it
+    if told:
+        np.testing.assert_array_equal(decode_intrinsics(info, (480, 640)), K)
+    own = make_info(K, *((640, 480) if told else ()))
+    own.binning_x = own.binning_y = 2
+    half = decode_intrinsics(own, (240, 320))
+    np.testing.assert_allclose(half[:2], K[:2] / 2)
+
+
+def test_a_part_of_a_raw_image_is_rectified_about_its_own_axis() -> None:
+    rgb, depth, K = read_scene()
+    depth = depth.astype(np.float32)
+    lens = (-0.3, 0.1, 0.0, 0.0, 0.0)
+    height, width = depth.shape
+    info = dataclasses.replace(make_info(K, width, height), d=np.array(lens))
+    whole, _ = rectify(rgb, depth, info)
+    info.roi.x_offset, info.roi.y_offset = 40, 20
+    info.roi.width, info.roi.height = width - 80, height - 50
+    cut = np.s_[20 : height - 30, 40 : width - 40]
+    part, z = rectify(rgb[cut], depth[cut], info)
+    inner = np.s_[30:-30, 30:-30]  # what the part shows of the whole
+    assert part.shape[:2] == z.shape
+    # by as much as interpolation rounds
+    assert np.abs(part[inner].astype(int) - whole[cut][inner]).max() <= 2
 
 
 @pytest.mark.parametrize(

@@ -178,14 +178,7 @@ class BagReader:
                 f"depth={self.topics.depth}: {z.shape[1]}x{z.shape[0]} pixels, but the color image "
                 f"has {rgb.shape[1]}x{rgb.shape[0]}; name a topic of depth aligned to color"
             )
-        size = (int(camera.height), int(camera.width))
-        if all(size) and size != rgb.shape[:2]:  # zeros where it is not told
-            raise UserError(
-                f"camera_info={self.topics.camera_info}: is of images of {size[1]}x{size[0]} "
-                f"pixels, but those of {self.topics.color} have {rgb.shape[1]}x{rgb.shape[0]}; "
-                "name the camera's own topic"
-            )
-        K = decode_intrinsics(camera, self.topics.camera_info)
+        K = decode_intrinsics(camera, z.shape, self.topics.camera_info)
         if self.rectify:
             rgb, z = rectify(rgb, z, camera, self.topics.camera_info)
         return BagFrame(rgb, z, K, color[2].header, color[1])

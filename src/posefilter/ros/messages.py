@@ -151,18 +151,58 @@ def _read_rows(message: Any, topic: str, key: str, kind: np.dtype, channels: int
     return np.ascontiguousarray(rows).view(kind).reshape(height, width, channels)
 
 
-def decode_intrinsics(message: Any, topic: str = "camera_info") -> np.ndarray:
+def decode_intrinsics(
+    message: Any, size: tuple[int, int], topic: str = "camera_info"
+) -> np.ndarray:
     """Return the camera matrix (3, 3) [px] of a CameraInfo: of the rectified image where it has
     one.
 
+    Args:
+        message: The CameraInfo; its matrices are of the whole sensor, which a region of interest
+            and binning make smaller.
+        size: Height and width of the image [px].
+        topic: Told in errors.
+
     Raises:
-        UserError: The camera is not calibrated.
+        UserError: The camera is not calibrated, or is of an image of another size.
     """
+    return _read_matrices(message, size, topic)[1]
+
+
+def _read_matrices(
+    message: Any, size: tuple[int, int], topic: str
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return K of raw images, zeros where it is not told, and the matrix of rectified ones."""
     P = np.asarray(message.p, dtype=np.float64).reshape(3, 4)[:, :3]
     K = np.asarray(message.k, dtype=np.float64).reshape(3, 3)
     if not P[0, 0] > 0 and not K[0, 0] > 0:  # so a driver says it
         raise UserError(f"camera_info={topic}: the camera is not calibrated (K and P are 0)")
-    return P if P[0, 0] > 0 else K
+    part = _find_part(message, size, topic)
+    return part @ K, part @ (P if P[0, 0] > 0 else K)
+
+
+def _find_part(message: Any, size: tuple[int, int], topic: str) -> np.ndarray:
+    """Return what makes the whole sensor's pixels those of an image, (3, 3).
+
+    The principal point is divided by the binning as it is, as in ROS's image_geometry.
+    """
+    roi = message.roi
+    whole = (int(message.height), int(message.width))
+    if size == whole:  # also where a driver tells the binning of matrices that are of this size
+        return np.eye(3)
+    bins = (max(int(message.binning_y), 1), max(int(message.binning_x), 1))
+    region = (int(roi.height), int(roi.width))
+    sides = region if all(region) else whole  # 0: the whole sensor, or not told
+    shown = tuple(side // each for side, each in zip(sides, bins, strict=True))
+    if all(sides) and size != shown:
+        raise UserError(
+            f"camera_info={topic}: is of images of {shown[1]}x{shown[0]} pixels, but the color "
+            f"image has {size[1]}x{size[0]}; name the camera's own topic"
+        )
+    y, x = bins
+    return np.array(
+        [[1 / x, 0, -int(roi.x_offset) / x], [0, 1 / y, -int(roi.y_offset) / y], [0, 0, 1]]
+    )
 
 
 def rectify(
@@ -172,10 +212,10 @@ def rectify(
     `decode_intrinsics` returns.
 
     Raises:
-        UserError: The camera is not calibrated, is of a stereo pair, or has another distortion.
+        UserError: The camera is not calibrated, is of images of another size or of a stereo pair,
+            or has another distortion.
     """
-    wanted = decode_intrinsics(message, topic)
-    K = np.asarray(message.k, dtype=np.float64).reshape(3, 3)
+    K, wanted = _read_matrices(message, rgb.shape[:2], topic)
     R = np.asarray(message.r, dtype=np.float64).reshape(3, 3)
     if not K[0, 0] > 0:
         raise UserError(f"camera_info={topic}: has no matrix K of raw images; rectify=false?")
