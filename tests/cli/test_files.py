@@ -68,6 +68,16 @@ def test_a_broken_checkpoint_does_not_replace_the_one_before(tmp_path: Path) -> 
     assert step(tmp_path / "last.previous.ckpt") == 2
 
 
+def test_many_small_tensors_are_written_without_gaps(tmp_path: Path) -> None:
+    many = {f"tensor_{number}": torch.full((2,), float(number)) for number in range(200)}
+    torch.save(many, tmp_path / "plain.ckpt")
+    save_whole(many, tmp_path / "whole.ckpt")
+    sizes = [(tmp_path / f"{name}.ckpt").stat().st_size for name in ("plain", "whole")]
+    assert sizes[0] - sizes[1] > 200 * 20
+    kept = torch.load(tmp_path / "whole.ckpt", weights_only=True)
+    assert all(torch.equal(kept[name], value) for name, value in many.items())
+
+
 def test_what_cannot_be_written_whole_leaves_what_was_there(tmp_path: Path) -> None:
     """A process that may write no more than some bytes, as on a full disk."""
     file = tmp_path / "last.ckpt"

@@ -78,6 +78,12 @@ def test_a_path_is_taken_as_it_is_and_a_name_is_found_among_what_ships(tmp_path:
     assert find_weights("003_cracker_box").is_file()
 
 
+def test_what_ships_is_small_enough_to_be_cloned() -> None:
+    sizes = [file.stat().st_size for file in find_weights("003_cracker_box").parent.glob("*.ckpt")]
+    assert len(sizes) == 14
+    assert sum(sizes) <= 40e6
+
+
 def test_a_name_elsewhere_is_fetched_once(
     server: Server, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
