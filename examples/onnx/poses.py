@@ -41,7 +41,8 @@ class PoseFilter:
         size = (s["camera"][1], s["camera"][0])
         if rgb.shape[:2] != size or depth.shape != size:
             sys.exit(f"exported for images of {size[1]}x{size[0]}: export with width=, height=")
-        image = {"rgb": rgb, "depth": np.float32(depth), "intrinsics": np.float32(intrinsics)}
+        depth = np.float32(np.where(depth < 100, depth, 0))  # what is farther is not measured
+        image = {"rgb": rgb, "depth": depth, "intrinsics": np.float32(intrinsics)}
         return self.search(image, rng, s.get("zoom"))
 
     def search(self, image, rng, zoom):

@@ -101,7 +101,8 @@ class Estimator:
         """Find each object in an image, or in each of a batch.
 
         With `instances`, an image may show an object more than once, and no two results are on the
-        same pixels: the more probable keeps them.  An object that is absent then has no result.
+        same pixels: the more probable keeps them.  An object that is absent then has no result;
+        in an image that cannot be judged (`Result.blank`) each has one, which is unsure.
 
         Args:
             rgb: Color, RGB, as a numpy array or tensor: (H, W, 3) or (3, H, W), uint8 or float in
@@ -152,6 +153,10 @@ class Estimator:
         out, blank = [], list_blank(images)
         for i in range(len(images.depth)):
             one = Images(*(part[i : i + 1] for part in images))
+            if blank[i]:  # what cannot be judged is not searched for more, and is told as such
+                runs = self.run(one, seed)
+                out.extend(collect_results(runs, self.costs, self.pose_tolerance))
+                continue
             batches = [
                 Batch(*(x.to(method.device) for x in make_batch(one, *own)))
                 for method, own in zip(self.methods, self._sizes, strict=True)

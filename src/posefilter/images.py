@@ -15,7 +15,7 @@ from posefilter.data.readers.plausible import (
 from posefilter.data.resize import network_size, resize_depth
 from posefilter.errors import UserError
 from posefilter.geometry.camera import resize_intrinsics
-from posefilter.limits import MOST_SIDE
+from posefilter.limits import FEWEST_KNOWN, MOST_SIDE
 from posefilter.types import Batch
 
 _INSTEAD = {  # of shapes of intrinsics that users have
@@ -24,7 +24,7 @@ _INSTEAD = {  # of shapes of intrinsics that users have
     (12,): "of a projection matrix P of rectified images give P.reshape(3, 4)[:, :3]",
     (4,): "of fx, fy, cx, cy give [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]",
 }
-_BEYOND = 100.0  # [m] no depth camera measures
+BEYOND = 100.0  # [m] no depth camera measures
 _FEWEST = 0.02  # share of the pixels with depth
 _NEAREST, _FARTHEST = 0.05, 30.0  # [m] between which the median depth of an image lies
 
@@ -53,7 +53,7 @@ def check_images(rgb: Any, depth: Any, intrinsics: Any, empty: bool = False) -> 
         UserError: A shape, type or value is not as it should be.
     """
     color = _as_channels_last(rgb)
-    z, K = _as_array(depth, "depth"), _as_array(intrinsics, "intrinsics")
+    z, K = as_array(depth, "depth"), as_array(intrinsics, "intrinsics")
     batched = color.ndim == 4
     color, z = (value if batched else value[None] for value in (color, z))
     if z.ndim == 4 and z.shape[1] == 1:  # (B, 1, H, W), as torch has it
@@ -91,7 +91,7 @@ def to_camera(intrinsics: Any) -> np.ndarray:
     Raises:
         UserError: It is none.
     """
-    return check_intrinsics(_as_array(intrinsics, "intrinsics"), 1)[0]
+    return check_intrinsics(as_array(intrinsics, "intrinsics"), 1)[0]
 
 
 def to_pose(pose: Any) -> np.ndarray:
@@ -100,7 +100,7 @@ def to_pose(pose: Any) -> np.ndarray:
     Raises:
         UserError: It is none.
     """
-    out = _as_array(pose, "pose")
+    out = as_array(pose, "pose")
     if out.shape != (4, 4) or out.dtype.kind not in "fiu":
         raise UserError(
             f"pose: has shape {out.shape} and type {out.dtype}; "
@@ -118,7 +118,12 @@ def make_batch(images: Images, image_width: int | None, image_height: int | None
         image_height: Its height [px], likewise; both None: images stay as they are.
     """
     before = images.depth.shape[1:]
-    height, width = network_size(before[0], before[1], image_width, image_height)
+    return make_sized_batch(images, *network_size(before[0], before[1], image_width, image_height))
+
+
+def make_sized_batch(images: Images, height: int, width: int) -> Batch:
+    """Return images resized to a size [px], as `make_batch` does."""
+    before = images.depth.shape[1:]
     rgb, depth, K = list(images.rgb), list(images.depth), torch.from_numpy(images.intrinsics)
     if (height, width) != before:
         how = cv2.INTER_AREA if width <= before[1] else cv2.INTER_LINEAR
@@ -142,7 +147,7 @@ def make_batch(images: Images, image_width: int | None, image_height: int | None
 
 
 def _as_channels_last(rgb: Any) -> np.ndarray:
-    color = _as_array(rgb, "rgb")
+    color = as_array(rgb, "rgb")
     if color.ndim not in (3, 4) or 3 not in (color.shape[-1], color.shape[-3]):
         raise UserError(
             f"rgb: has shape {color.shape}; expected (H, W, 3), or a batch (B, H, W, 3)"
@@ -150,7 +155,12 @@ def _as_channels_last(rgb: Any) -> np.ndarray:
     return color if color.shape[-1] == 3 else np.moveaxis(color, -3, -1)
 
 
-def _as_array(value: Any, name: str) -> np.ndarray:
+def as_array(value: Any, name: str) -> np.ndarray:
+    """Return an array, tensor or nested list as an array.
+
+    Raises:
+        UserError: It is none.
+    """
     if value is None or isinstance(value, str | Path):
         raise UserError(f"{name}: is {value!r}; must be an array or tensor, not a file name")
     if isinstance(value, torch.Tensor):
@@ -184,7 +194,10 @@ def check_depth_unit(depth: np.ndarray) -> None:
     """
     some = drop_unknown(depth[::16, ::16])
     some = some[some > 0]
-    if len(some) and not _NEAREST < (median := float(np.median(some))) < _FARTHEST:
+    if not len(some) or _NEAREST < (median := float(np.median(some))) < _FARTHEST:
+        return
+    # of noise on a covered sensor a median tells nothing
+    if np.count_nonzero(drop_unknown(depth)) >= FEWEST_KNOWN * depth.size:
         raise UserError(f"depth: the median would be {median:.3g} m; is it in meters?")
 
 
@@ -194,7 +207,7 @@ def drop_unknown(depth: np.ndarray) -> np.ndarray:
 
     Where nearly all of it is so far it stays: it is in another unit then.
     """
-    near = (depth > 0) & (depth < _BEYOND)
+    near = (depth > 0) & (depth < BEYOND)
     if np.count_nonzero(near) < _FEWEST * depth.size:  # else a share of those with depth, too
         known = np.isfinite(depth) & (depth > 0)
         if np.count_nonzero(near) < _FEWEST * np.count_nonzero(known):
@@ -211,9 +224,9 @@ def _check_depth(depth: np.ndarray, empty: bool) -> np.ndarray:
     z = drop_unknown(depth)
     for number, one in enumerate(z):
         which = f" of image {number}" if len(z) > 1 else ""
+        if empty and np.count_nonzero(one) < FEWEST_KNOWN * one.size:
+            continue  # covered, but for noise
         if not one.any():
-            if empty:
-                continue
             raise UserError(f"depth{which}: no pixel has depth")
         median = float(np.median(one[one > 0]))
         if not _NEAREST < median < _FARTHEST:

@@ -14,6 +14,7 @@ from PIL import Image, UnidentifiedImageError
 from posefilter.errors import BadData, find_reason
 
 MOST_SIDE, MOST_PIXELS = 16_384, 1 << 27  # of an image: a photograph of 100 megapixels passes
+FEWEST_KNOWN = 0.001  # share of an image's pixels with depth, below which it cannot be judged
 MOST_BYTES = 1 << 29  # of an image's or JSON's file
 
 

@@ -403,6 +403,7 @@ def test_images_are_resized_as_before_prediction(before: tuple[int, int], width:
     rgb = cv2.GaussianBlur(draw.integers(0, 256, (*before, 3), dtype=np.uint8), (0, 0), 2)
     depth = np.float32(draw.uniform(0.6, 0.62, before) + (draw.random(before) < 0.3))
     depth[draw.random(before) < 0.1] = 0
+    depth[draw.random(before) < 0.1] = 1000  # where a simulator has nothing
     K = np.array([[0.9 * before[1], 0, 31.5], [0, 0.9 * before[1], 20.2], [0, 0, 1]])
     ours = make_batch(check_images(rgb, depth, K)[0], width, None)
     resize = Resize(before, (ours.rgb.shape[2], ours.rgb.shape[3]))

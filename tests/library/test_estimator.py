@@ -219,6 +219,12 @@ def test_an_image_of_one_color_or_depth_is_doubted(estimator: posefilter.Estimat
         assert cause in result.blank == result.warnings[0]
     (found,) = estimator.predict(0 * rgb, depth, K, instances=1)
     assert found.verdict == "unsure"
+    ((covered,), seen) = estimator.predict(
+        images[1:], np.stack([depth[::-1], depth]), K, instances=2
+    )
+    assert covered.verdict == "unsure"
+    assert "covered lens" in covered.blank
+    assert all(one.blank == "" for one in seen)
 
 
 def test_the_belief_of_an_instance_is_as_wide_as_errors_are(

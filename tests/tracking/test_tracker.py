@@ -270,6 +270,24 @@ def test_in_doubt_the_network_sees_the_whole_image() -> None:
     assert sizes[1:3] == [None, (120, 160)]
 
 
+def test_later_frames_may_be_covered_and_cameras_be_of_any_kind() -> None:
+    toy, estimator = make_toy()
+    tracker = posefilter.Tracker(estimator, seed=2**64)
+    toy.truth = walk_pose(1)[0]
+    tracker.update(RGB, DEPTH, K)
+    for noise in (0.03, 65.535):  # of a hand on the sensor, or saturated
+        covered = NONE.copy()
+        covered[16, 32] = noise
+        result = tracker.update(RGB, covered, K)
+        assert "1 of 19200 pixels have depth" in result.blank
+    with pytest.raises(UserError, match="is it in meters"):
+        tracker.update(RGB, 1000 * DEPTH, K)
+    for camera in (torch.tensor(K, requires_grad=True), torch.tensor(K).bfloat16(), K.tolist()):
+        assert tracker.update(RGB, DEPTH, camera).is_tracked
+    with pytest.raises(UserError, match="one size"):
+        tracker.update(RGB, DEPTH, [[1.0, 0.0], [0.0, 1.0, 0.0]])
+
+
 @pytest.mark.parametrize("patience", [1, 3])
 def test_a_track_loss_detector_counts_frames_in_a_row(patience: int) -> None:
     detector = TrackLossDetector(

@@ -4,6 +4,8 @@ import numpy as np
 import pytest
 import torch
 
+from posefilter.images import Images
+from posefilter.tracking.frame import Frame
 from posefilter.tracking.window import place_window
 from posefilter.types import ObjectModel
 
@@ -45,3 +47,27 @@ def test_a_window_is_cut_at_the_photographs_edge() -> None:
     assert window.seen_width < window.seen_height == 320
     assert place_window(at(-5.0, 0.6), MODEL, K, (960, 1280), 1.0, 320, 1.25) is None
     assert place_window(at(0.0, 0.04), MODEL, K, (960, 1280), 1.0, 320, 1.25) is None
+
+
+def test_a_window_of_a_small_photograph_is_seen_although_cells_stretch_it() -> None:
+    """Where the scale is above 1 and not whole, an edge cuts windows to whole pixels of both."""
+    draw = np.random.default_rng(0)
+    height, width = 144, 176
+    own = np.array([[170.0, 0, 87.5], [0, 170, 71.5], [0, 0, 1]])
+    rgb = draw.integers(0, 256, (1, height, width, 3), dtype=np.uint8)
+    frame = Frame(Images(rgb, np.ones((1, height, width), np.float32), own[None]))
+    stretched = 0
+    for place in draw.uniform(-0.55, 0.55, (200, 2)):
+        pose = at(2.2 * place[0], 2.2)
+        pose[1, 3] = 2.2 * 0.7 * place[1]
+        window = place_window(pose, MODEL, own, (height, width), 320 / width, 160, 1.25)
+        if window is None:
+            continue
+        batch = frame.see_window(window)
+        assert batch.rgb.shape[2:] == (window.seen_height, window.seen_width)
+        scale = batch.intrinsics[0].diagonal()[:2].double().numpy() / 170
+        np.testing.assert_allclose(
+            scale, (window.seen_width / window.width, window.seen_height / window.height), rtol=1e-6
+        )
+        stretched += abs(scale[0] / scale[1] - 1) > 0.02
+    assert stretched > 5

@@ -8,10 +8,11 @@ such image: what it says of one is not to be believed, neither "found" nor "abse
 import cv2
 import numpy as np
 
+from posefilter.limits import FEWEST_KNOWN
+
 # averaged over squares of 8 px, so that a sensor's noise is no contrast
 _SIDE = 8
 _CONTRAST = 10 / 255  # 1,500 renders have 49 / 255 at least, photographs more
-_FEWEST = 0.001  # of the pixels have depth
 _RELIEF = 0.005  # [m]; the same renders have 0.07 at least
 
 
@@ -33,10 +34,10 @@ def find_blank(rgb: np.ndarray, depth: np.ndarray) -> str:
         return f"the color image is {color}, so that nothing can be judged by it"
     some = depth[::_SIDE, ::_SIDE]
     some = some[np.isfinite(some) & (some > 0)]
-    if len(some) >= _FEWEST * depth.size and float(np.ptp(some)) >= _RELIEF:
+    if len(some) >= FEWEST_KNOWN * depth.size and float(np.ptp(some)) >= _RELIEF:
         return ""  # as of nearly all images, without looking at each pixel
     known = depth[np.isfinite(depth) & (depth > 0)]
-    if len(known) < _FEWEST * depth.size:
+    if len(known) < FEWEST_KNOWN * depth.size:
         return (
             f"{len(known)} of {depth.size} pixels have depth (a covered sensor, or not the right "
             "file?), so that nothing can be judged by it"

@@ -10,6 +10,7 @@ from torch import Tensor, nn
 
 from posefilter.data.resize import SMOOTH, find_neighbors
 from posefilter.geometry.camera import resize_intrinsics
+from posefilter.images import BEYOND
 
 
 class Resize(nn.Module):
@@ -41,14 +42,14 @@ class Resize(nn.Module):
 
         Args:
             rgb: (H, W, 3) uint8, RGB.
-            depth: (H, W) [m], 0 where unknown.
+            depth: (H, W) [m]; unknown where it is 0, not finite, or 100 m and more.
             intrinsics: (3, 3) [px].
 
         Returns:
             Color (1, 3, h, w) in [0, 1], depth (1, 1, h, w) [m] and camera matrix (1, 3, 3).
         """
         color = rgb.permute(2, 0, 1)[None].float().contiguous()
-        z = torch.where((depth > 0) & (depth < torch.inf), depth, torch.zeros_like(depth))
+        z = torch.where((depth > 0) & (depth < BEYOND), depth, torch.zeros_like(depth))
         if self.before == self.after:
             return color / 255, z[None, None], intrinsics[None]
         color = torch.floor(self.resize_color(color) + 0.5) / 255

@@ -3,7 +3,7 @@
 from functools import cached_property
 
 from posefilter.confidence.blank import find_blank
-from posefilter.images import Images, drop_unknown, make_batch
+from posefilter.images import Images, drop_unknown, make_batch, make_sized_batch
 from posefilter.tracking.window import Window, cut_window
 from posefilter.types import Batch
 
@@ -37,4 +37,5 @@ class Frame:
     def see_window(self, window: Window) -> Batch:
         """Return a part of the photograph."""
         part = cut_window(self.images, window)
-        return make_batch(part, window.seen_width, window.seen_height)
+        # its sides are whole pixels of both, so that it may be stretched by one of them
+        return make_sized_batch(part, window.seen_height, window.seen_width)

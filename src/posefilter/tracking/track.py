@@ -146,7 +146,9 @@ class Track:
 
     def reset(self) -> None:
         """Forget the object: the next frame is the first."""
-        self.generator = torch.Generator(device=self.method.device).manual_seed(self.seed)
+        self.generator = torch.Generator(device=self.method.device).manual_seed(
+            self.seed % (1 << 63)
+        )
         self.state: State | None = None
         self.loss_detector = TrackLossDetector(self.settings)
         self.frames = 0

@@ -8,7 +8,13 @@ import torch
 
 from posefilter.errors import UserError
 from posefilter.estimator import Estimator, check_seed, get_trained_size
-from posefilter.images import Images, check_depth_unit, check_images, check_intrinsics
+from posefilter.images import (
+    Images,
+    as_array,
+    check_depth_unit,
+    check_images,
+    check_intrinsics,
+)
 from posefilter.tracking.frame import Frame
 from posefilter.tracking.processes import MultiprocessTracker
 from posefilter.tracking.settings import TrackerSettings
@@ -151,7 +157,7 @@ class Tracker:
         )
         if fast:
             check_depth_unit(depth)
-            K = check_intrinsics(np.asarray(intrinsics), 1, depth.shape)
+            K = check_intrinsics(as_array(intrinsics, "intrinsics"), 1, depth.shape)
             return Images(rgb[None], depth[None], K)
         images, batched = check_images(rgb, depth, intrinsics, empty=True)
         if batched:
