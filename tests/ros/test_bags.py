@@ -459,6 +459,36 @@ def test_each_image_has_the_depth_nearest_in_time(tmp_path: Path) -> None:
     assert pairs == [(number, 1000 + number) for number in (0, 1, 2, 4, 5)]
 
 
+@pytest.mark.parametrize(
+    ("stamps", "tolerance", "wanted"),
+    [
+        # depth faster than color: the first within the tolerance is not the nearest
+        (["c8", "d0", "d8", "c41", "d33", "d41"], 0.01, [(8, 8), (41, 41)]),
+        (["d0", "d8", "c8", "c41", "d44"], 0.01, [(8, 8), (41, 44)]),
+        # color faster than depth: the depth is the later image's
+        (["c0", "d15", "c16", "c33", "c49", "d48"], 0.02, [(16, 15), (49, 48)]),
+        (["c0", "c30", "d9", "d39"], 0.01, [(0, 9), (30, 39)]),
+    ],
+)
+def test_color_and_depth_are_nearest_to_one_another(
+    stamps: list[str], tolerance: float, wanted: list[tuple[int, int]], tmp_path: Path
+) -> None:
+    """Whatever is recorded first."""
+    K = np.array([[100.0, 0, 2], [0, 100, 2], [0, 0, 1]])
+    messages = [("/info", CAMERA_INFO, 0, make_info(K))]
+    for order, (topic, time) in enumerate([(one[0], int(one[1:])) for one in stamps], 1):
+        color = np.full((4, 4, 3), time, np.uint8)
+        image = make_image(color, "rgb8", time)
+        if topic == "d":
+            image = make_image(np.full((4, 4), 1000 + time, np.uint16), "16UC1", time)
+        messages.append(("/rgb" if topic == "c" else "/depth", IMAGE, order, image))
+    with BagReader(write_bag(tmp_path / "in", messages), TOPICS, tolerance) as reader:
+        frames = [*reader.frames()]
+        assert reader.unpaired == sum(one[0] == "c" for one in stamps) - len(wanted)
+    depths = [round(float(one.depth[0, 0]) * 1000) - 1000 for one in frames]
+    assert [*zip([int(one.rgb[0, 0, 0]) for one in frames], depths, strict=True)] == wanted
+
+
 def test_mistakes_are_one_line(tmp_path: Path, capfd) -> None:
     bag = write_scene(tmp_path / "in", (50,))
     near = write_scene(tmp_path / "near", (5,), depth_share=0.01)

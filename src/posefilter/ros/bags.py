@@ -138,19 +138,35 @@ class BagReader:
                 camera = message
                 self.distorted |= is_distorted(message) and not self.rectify
                 continue
-            own, other = (
-                (colors, depths) if connection.topic == self.topics.color else (depths, colors)
-            )
-            stamp = stamp_of(message)
-            near = min(other, key=lambda one: abs(one[0] - stamp), default=None)
-            if near is None or abs(near[0] - stamp) > self.tolerance or camera is None:
-                self.unpaired += own is colors and len(own) == _WAITING
-                own.append((stamp, time, message))
-                continue
-            other.remove(near)
-            mine = (stamp, time, message)
-            yield self._make(*((mine, near) if own is colors else (near, mine)), camera)
+            own = colors if connection.topic == self.topics.color else depths
+            self.unpaired += own is colors and len(own) == _WAITING
+            own.append((stamp_of(message), time, message))
+            if camera is not None:
+                yield from self._pair(colors, depths, camera)
+        if camera is not None:
+            yield from self._pair(colors, depths, camera, ended=True)
         self.unpaired += len(colors)
+
+    def _pair(
+        self, colors: deque[Any], depths: deque[Any], camera: Any, ended: bool = False
+    ) -> Iterator[BagFrame]:
+        """Yield each color image and the depth that are nearest to one another in time.
+
+        That is known once both topics have told of a moment as late, or the bag has ended; what is
+        yielded waits no longer.
+        """
+        for color in [*colors]:
+            near = min(depths, key=lambda one: abs(one[0] - color[0]), default=None)
+            if near is None or abs(near[0] - color[0]) > self.tolerance:
+                continue
+            own = min(colors, key=lambda one: abs(one[0] - near[0]))
+            later = max(color[0], near[0])
+            known = max(one[0] for one in colors) >= later <= max(one[0] for one in depths)
+            if own is not color or not (known or ended):
+                continue
+            colors.remove(color)
+            depths.remove(near)
+            yield self._make(color, near, camera)
 
     def _drop_early(self, colors: deque[Any], depths: deque[Any]) -> None:
         """Drop the pairs that came before the camera was known, and count them."""
