@@ -36,19 +36,21 @@ from posefilter.confidence.fit import (
     fit_choice,
     make_frames,
 )
+from posefilter.confidence.second_look import look_again
 from posefilter.confidence.tolerance import PoseErrors, measure_pose_errors
 from posefilter.confidence.verdicts import Costs, score_verdicts
 from posefilter.data.absent import hide_annotation
 from posefilter.data.dataset import FrameDataset
 from posefilter.data.loaders import make_loader
 from posefilter.errors import UserError
+from posefilter.filters.traces import keep_last_step
 from posefilter.locks import hold
 from posefilter.metrics.confidence import Confidence
 from posefilter.metrics.credibility import score_truth
 from posefilter.metrics.registry import find_metric
 from posefilter.models.base import PoseEstimator
 from posefilter.progress import watched
-from posefilter.types import Batch, BeliefBatch, ObjectModel
+from posefilter.types import Batch, BeliefBatch, ObjectModel, Trace
 
 _BATCH = 8  # images
 _SHOWN = ("auroc", "auroc_presence", "ece", "brier", "found", "false_alarms")
@@ -121,22 +123,32 @@ class Beliefs(NamedTuple):
         return Beliefs(BeliefBatch(*(part[index] for part in self.beliefs)), self.truth[index])
 
 
+class FirstAnswers(NamedTuple):
+    """The first answers to one batch of images."""
+
+    trace: Trace  # its last step, without the encoded images
+    draws: Tensor  # state of the generator that other searches go on with
+
+
 def collect_frames(
     method: PoseEstimator,
     present: Sequence[FrameDataset],
     absent: Sequence[FrameDataset],
     shown: bool = False,
-) -> tuple[Frames, Beliefs]:
+    first_answers: Sequence[FirstAnswers] = (),
+) -> tuple[Frames, Beliefs, list[FirstAnswers]]:
     """Run a filter on frames with the object and without, and return what speaks for each
-    estimate, how far it is off, and the beliefs of frames with the object.
+    estimate, how far it is off, the beliefs of frames with the object, and the first answers.
 
     Args:
-        method: A method with its weights.
+        method: A method with its weights; calibrated, it searches again where it doubts.
         present: Frames with the object.
         absent: Frames without.
         shown: Draw a bar.
+        first_answers: Those of an earlier call with the same frames, which are not searched for
+            again: estimates, and the draws of other searches, stay what they would be.
     """
-    values, there, errors, beliefs = [], [], [], []
+    values, there, errors, beliefs, answers = [], [], [], [], []
     parts = [(one, True) for one in present] + [(one, False) for one in absent]
     loaders = [(make_loader(one, _BATCH, 0), is_there) for one, is_there in parts]
     count = sum(len(loader) for loader, _ in loaders)
@@ -146,7 +158,17 @@ def collect_frames(
         truth = batch.camera_from_object
         seen = Batch(*(x.to(method.device) for x in hide_annotation(batch)))
         with torch.no_grad():
-            trace = method.predict_step(seen, number)
+            generator = method.generator("predict", number)
+            if first_answers:
+                answer = first_answers[number]
+                generator.set_state(answer.draws)
+                trace = answer.trace._replace(encoding=method.encode(seen))
+            else:
+                trace = method.search(seen, generator)
+                last = keep_last_step(trace)._replace(encoding=None)  # the rest takes gigabytes
+                answer = FirstAnswers(last, generator.get_state())
+            answers.append(answer)
+            trace = look_again(method, trace, seen, generator)
             values.append(method.collect_features(trace, seen))
         there.append(np.full(len(truth), is_there))
         off = PoseErrors(*[np.full(len(truth), np.nan)] * 4)
@@ -156,7 +178,7 @@ def collect_frames(
             beliefs.append((*(part.cpu() for part in trace.belief), truth))
         errors.append(off)
     *own, truths = (torch.cat(parts) for parts in zip(*beliefs, strict=True))
-    return make_frames(values, there, errors), Beliefs(BeliefBatch(*own), truths)
+    return make_frames(values, there, errors), Beliefs(BeliefBatch(*own), truths), answers
 
 
 def learn(
@@ -168,8 +190,8 @@ def learn(
 ) -> Calibration:
     """Return the calibration of a method, with its quality on held-out parts of the frames.
 
-    Frames are searched twice: first answers teach what answers are compared by; the answers that
-    are then chosen teach the probabilities, and how wide a belief is.
+    First answers teach what answers are compared by; those that are then chosen, after other
+    searches of images whose first answer is doubtful, teach the probabilities, and how wide a belief is.
 
     Args:
         method: A method with its weights; its calibration is replaced.
@@ -179,10 +201,10 @@ def learn(
         shown: Draw bars.
     """
     method.calibration, first = None, None
-    frames, beliefs = collect_frames(method, present, absent, shown)
+    frames, beliefs, answers = collect_frames(method, present, absent, shown)
     if method.filter.max_searches > 1:
         method.calibration = first = fit_choice(frames, source)
-        frames, beliefs = collect_frames(method, present, absent, shown)
+        frames, beliefs, _ = collect_frames(method, present, absent, shown, answers)
     held = cross_validate(frames, first=first)
     scores = measure_quality(frames, held)
     quality = {key: float(scores[key]) for key in _SHOWN if math.isfinite(scores[key])}

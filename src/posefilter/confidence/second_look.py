@@ -22,7 +22,7 @@ from torch import Generator, Tensor
 
 from posefilter.confidence.calibration import Calibration
 from posefilter.confidence.visible_pixels import blank, find_visible
-from posefilter.filters.traces import map_traces
+from posefilter.filters.traces import keep_last_step, map_traces
 from posefilter.types import Batch, Trace
 
 DOUBTFUL = 0.5  # rank below which an answer is doubtful
@@ -55,7 +55,7 @@ def look_again(method: Any, first: Trace, batch: Batch, generator: Generator) ->
 
     Args:
         method: A `PoseEstimator` that was calibrated; any other's trace is returned as it is.
-        first: A finished run of its filter.
+        first: A finished run of its filter, or the last step of one.
         batch: Its B images; mask and pose are not used.
         generator: Draws the other searches.
 
@@ -139,6 +139,8 @@ def _list_parts(method: Any, image: Batch, rest: Batch) -> Iterator[Batch]:
 
 def _put(trace: Trace, row: int, found: Trace) -> Trace:
     """Return a trace with the row of one image replaced by another trace's only one."""
+    if len(trace.steps) == 1:
+        found = keep_last_step(found)
 
     def put(old: Tensor, new: Tensor) -> Tensor:
         out = old.clone()

@@ -1,4 +1,4 @@
-"""Take, replace and merge the images of traces."""
+"""Take, replace and merge the images of traces, and keep the last of their steps."""
 
 from collections.abc import Callable
 from typing import Any
@@ -31,3 +31,10 @@ def map_traces(change: Callable[..., Tensor], *traces: Trace) -> Trace:
     bare = [trace._replace(encoding=None) for trace in traces]
     out: Trace = map_tensors(change, *bare)
     return out._replace(encoding=traces[0].encoding)
+
+
+def keep_last_step(trace: Trace) -> Trace:
+    """Return a trace of which particles, outputs and steps are the last alone."""
+    return trace._replace(
+        particles=trace.particles[-1:], outputs=trace.outputs[-1:], steps=trace.steps[-1:]
+    )

@@ -255,7 +255,7 @@ class PoseEstimator(Module):
         """Return what speaks for each estimate, by name.
 
         Args:
-            trace: A finished run of the filter.
+            trace: A finished run of the filter, or its last step alone.
             batch: Its B images; mask and pose are not used.
 
         Returns:
