@@ -14,6 +14,7 @@ from posefilter.cli.files import pack_whole
 from posefilter.data.readers.registry import open_meshes
 from posefilter.files import write_whole
 from posefilter.meshes.mesh import object_model
+from posefilter.models.quantization import pack_object
 
 
 def give_points(file: Path, meshes: str, count: int) -> int:
@@ -22,6 +23,7 @@ def give_points(file: Path, meshes: str, count: int) -> int:
     own = checkpoint["object_model"]
     mesh = open_meshes(meshes, None, "fat", [own["name"]]).load(own["name"])
     had, own["points"] = len(own["points"]), object_model(mesh, count=count).points
+    checkpoint["object_model"] = pack_object(own)
     write_whole(file, pack_whole(checkpoint), sync=True)
     return had
 

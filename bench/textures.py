@@ -17,7 +17,7 @@ from posefilter.cli.files import pack_whole
 from posefilter.data.readers.registry import open_meshes
 from posefilter.files import write_whole
 from posefilter.meshes.texture import add_texture
-from posefilter.types import ObjectModel
+from posefilter.models.quantization import pack_object, unpack_object
 
 TURNS = "posefilter.filters.texture.TextureRotations"
 REFINE = Path(__file__).parents[1] / "conf/filter/refine/mean_shift_icp_texture.yaml"
@@ -36,12 +36,9 @@ def give_texture(file: Path, meshes: str) -> int:
     checkpoint = read_checkpoint(file)
     own = checkpoint["object_model"]
     mesh = open_meshes(meshes, None, "fat", [own["name"]]).load(own["name"])
-    object_model = add_texture(ObjectModel(**own), mesh)
-    assert object_model.texture is not None
+    object_model = add_texture(unpack_object(own), mesh)
     assert object_model.shape_symmetries is not None
-    checkpoint["object_model"] = dict(
-        object_model._replace(texture=object_model.texture.half())._asdict()
-    )
+    checkpoint["object_model"] = pack_object(object_model._asdict())
     refine = checkpoint["recipe"]["settings"]["filter"]["refine"]
     refine["components"] = insert_turns(refine["components"])
     checkpoint["recipe"]["choices"]["filter/refine"] = REFINE.stem

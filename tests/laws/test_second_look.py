@@ -17,6 +17,7 @@ from torch import Generator, Tensor
 from posefilter.confidence.apparent_size import ApparentSize
 from posefilter.confidence.calibration import Calibration, Logistic
 from posefilter.confidence.second_look import look_again, measure_worth
+from posefilter.filters.traces import keep_last_step
 from posefilter.geometry.camera import back_project
 from posefilter.geometry.pose import make_pose
 from posefilter.models.zoom import with_encoding
@@ -71,7 +72,7 @@ class ToyFilter:
     """What the search needs of a filter.  The particle's pose holds the pixel that was found."""
 
     def __init__(self, max_searches: int) -> None:
-        self.max_searches, self.runs, self.draws = max_searches, 0, False
+        self.max_searches, self.runs, self.draws, self.steps = max_searches, 0, False, 1
 
     def __call__(self, batch: Batch, method: Any, generator: Generator) -> Trace:
         self.runs += 1
@@ -90,7 +91,7 @@ class ToyFilter:
         zeros = torch.zeros(len(index), 1)
         particles = Particles(place, zeros[..., None], zeros, zeros.long())
         belief = BeliefBatch(place, zeros, found, red.flatten(1).amax(1))
-        return Trace((particles,), (), (), belief, zeros, None)
+        return Trace((particles,) * self.steps, (), (), belief, zeros, None)
 
 
 def draw(images: list[list[tuple[int | float, ...]]], wall: float = 2.0) -> Batch:
@@ -162,6 +163,22 @@ def test_other_draws_are_tried_in_the_whole_image() -> None:
         if places(first)[0] < (9, 9):
             found.append(places(look_again(toy, first, batch, generator))[0] >= (9, 9))
     assert any(found)
+
+
+def test_the_last_step_of_a_first_answer_serves_as_the_whole_trace() -> None:
+    toy = Toy()
+    toy.filter.draws, toy.filter.steps = True, 3
+    batch = draw([[WRONG, RIGHT, (20, 20, 1.0, 0.4)]] * 6)
+    generator = Generator().manual_seed(0)
+    first = toy.filter(batch, toy, generator)
+    state = generator.get_state()
+    whole = look_again(toy, first, batch, generator)
+    assert places(whole) != places(first)
+    generator.set_state(state)
+    last = look_again(toy, keep_last_step(first), batch, generator)
+    assert places(last) == places(whole)
+    assert len(last.particles) == 1
+    assert torch.equal(last.particles[0].state, whole.particles[2].state)
 
 
 @pytest.mark.parametrize(

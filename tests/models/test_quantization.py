@@ -1,9 +1,10 @@
 """Packed weights are small, come back close, and leave alone what is not a float."""
 
 import torch
+from tests.models.toy import square
 from torch import nn
 
-from posefilter.models.quantization import pack, unpack
+from posefilter.models.quantization import pack, pack_object, unpack, unpack_object
 
 
 def net() -> nn.Module:
@@ -43,3 +44,15 @@ def test_a_plain_state_passes_unchanged() -> None:
     state = net().state_dict()
     for name, value in unpack(state).items():
         assert torch.equal(value, state[name])
+
+
+def test_surface_points_come_back_to_a_ten_thousandth_and_the_rest_as_it_was() -> None:
+    points = 0.1 * torch.randn(500, 3)
+    plain = {**square()._asdict(), "points": points, "texture": torch.rand(7, 9)}
+    packed = pack_object(plain)
+    assert packed["points"].dtype == packed["texture"].dtype == torch.float16
+    after = unpack_object(packed)
+    assert after.points.dtype == torch.float32
+    assert (after.points - points).abs().max() < 5e-4 * points.abs().max()
+    assert torch.equal(after.hull, plain["hull"])
+    assert pack_object({**plain, "texture": None})["texture"] is None

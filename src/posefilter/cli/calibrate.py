@@ -191,7 +191,8 @@ def learn(
     """Return the calibration of a method, with its quality on held-out parts of the frames.
 
     First answers teach what answers are compared by; those that are then chosen, after other
-    searches of images whose first answer is doubtful, teach the probabilities, and how wide a belief is.
+    searches of images whose first answer is doubtful, teach the probabilities, and how wide a
+    belief is.
 
     Args:
         method: A method with its weights; its calibration is replaced.

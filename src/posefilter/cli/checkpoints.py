@@ -20,7 +20,7 @@ from posefilter.confidence.calibration import read_calibration
 from posefilter.errors import UserError, find_reason
 from posefilter.filters.loop import MAX_SEARCHES
 from posefilter.models.base import PoseEstimator, with_lightning
-from posefilter.models.quantization import unpack
+from posefilter.models.quantization import unpack, unpack_object
 from posefilter.types import ObjectModel
 from posefilter.weights import expand_weights, find_weights
 
@@ -137,7 +137,7 @@ def method_of(
     state = unpack(checkpoint["state_dict"])
     elements = 4 * sum(value.numel() for value in state.values()) + _SPARE_ELEMENTS
     with Bounded(elements, 20 * len(state) + _SPARE_TENSORS, "checkpoint"):
-        method = build_method(recipe, ObjectModel(**checkpoint["object_model"]), lightning)
+        method = build_method(recipe, unpack_object(checkpoint["object_model"]), lightning)
     try:
         missing, foreign = method.load_state_dict(state, strict=False)
     except RuntimeError as error:  # tensors of other shapes

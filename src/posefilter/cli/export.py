@@ -14,7 +14,7 @@ from posefilter.cli.files import pack_whole
 from posefilter.cli.job import Job
 from posefilter.errors import UserError
 from posefilter.files import write_whole
-from posefilter.models.quantization import pack, unpack
+from posefilter.models.quantization import pack, pack_object, unpack
 
 _KEPT = ("state_dict", "recipe", "object_model", "calibration", "pytorch-lightning_version")
 
@@ -88,12 +88,10 @@ def strip(checkpoint: dict[str, Any], points: int, quantize: bool = False) -> di
     model, weights = dict(kept["object_model"]), unpack(kept["state_dict"])
     every = max(1, -(-len(model["points"]) // points))
     model["points"] = model["points"][::every].clone()
-    if quantize and model.get("texture") is not None:
-        model["texture"] = model["texture"].half()  # to a tenth of a millimeter
     settings = dict(kept["recipe"]["settings"])
     data = settings.get("data") or {}
     # no folders of the trainer's machine
     settings["data"] = {key: data[key] for key in OF_THE_CHECKPOINT if key in data}
     kept["recipe"] = {**kept["recipe"], "settings": settings}
     state = pack(weights) if quantize else {key: value.clone() for key, value in weights.items()}
-    return {**kept, "state_dict": state, "object_model": model}
+    return {**kept, "state_dict": state, "object_model": pack_object(model) if quantize else model}

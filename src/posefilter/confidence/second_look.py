@@ -139,7 +139,7 @@ def _list_parts(method: Any, image: Batch, rest: Batch) -> Iterator[Batch]:
 
 def _put(trace: Trace, row: int, found: Trace) -> Trace:
     """Return a trace with the row of one image replaced by another trace's only one."""
-    if len(trace.steps) == 1:
+    if len(trace.particles) < len(found.particles):
         found = keep_last_step(found)
 
     def put(old: Tensor, new: Tensor) -> Tensor:

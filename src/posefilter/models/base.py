@@ -36,6 +36,7 @@ from posefilter.metrics.results import compute_checkpoint_score, flatten
 from posefilter.models.box_heads import PoseBox
 from posefilter.models.clipping import clip_submodules
 from posefilter.models.lr_schedulers import find_length
+from posefilter.models.quantization import unpack_object
 from posefilter.models.zoom import choose_part, search
 from posefilter.protocols import Loss, Space
 from posefilter.types import (
@@ -583,7 +584,7 @@ class PoseEstimator(Module):
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Set the object that the checkpoint holds."""
-        self.set_object(ObjectModel(**checkpoint["object_model"]))
+        self.set_object(unpack_object(checkpoint["object_model"]))
 
 
 def _has_all_images() -> bool:

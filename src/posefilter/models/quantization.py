@@ -1,15 +1,18 @@
-"""Compact weight files: 8-bit kernels with one scale for each channel, the rest in half precision.
+"""Compact weight files: 8-bit kernels with one scale for each channel, the rest in half precision,
+of the object its surface points and colors.
 
-The error is about 1 % of a typical weight, far below the variation between trainings. A file is a
-quarter of its size in full precision.
+The error is about 1 % of a typical weight, far below the variation between trainings; of a point on
+an object of 20 cm, 0.03 mm. A file is a quarter of its size in full precision.
 """
 
 from collections.abc import Mapping
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from posefilter.errors import UserError
+from posefilter.types import ObjectModel
 
 _LEAST = 4096  # smaller tensors are not worth a scale
 _SUFFIX = "#scale"
@@ -56,3 +59,16 @@ def unpack(packed: Mapping[str, Tensor]) -> dict[str, Tensor]:
         whole = value.float() if value.is_floating_point() or scale is not None else value
         out[name] = whole if scale is None else whole * scale
     return out
+
+
+def pack_object(plain: Mapping[str, Any]) -> dict[str, Any]:
+    """Return an object, as a checkpoint holds it, with surface points and texture in half
+    precision.
+    """
+    held = ((key, plain.get(key)) for key in ("points", "texture"))
+    return {**plain, **{key: value.half() for key, value in held if value is not None}}
+
+
+def unpack_object(packed: Mapping[str, Any]) -> ObjectModel:
+    """Return the object that a checkpoint holds, its surface points in full precision."""
+    return ObjectModel(**{**packed, "points": packed["points"].float()})
