@@ -47,6 +47,11 @@ def move(pose: Tensor, twist: Tensor) -> Tensor:
     return move_about(pose, twist / twist.new_tensor([1.0] * 3 + [RADIUS] * 3), CENTER)
 
 
+def bare(probability: Tensor) -> Tensor:
+    """Return no features."""
+    return torch.zeros(len(probability), 0)
+
+
 def simulate(count: int, too_wide: float, slope: float, seed: int = 0) -> tuple[Beliefs, Tensor]:
     """Return beliefs whose particles are too wide by a factor, and what is said of them: errors
     shrink with the logit of the probability by `slope`.
@@ -68,7 +73,9 @@ def simulate(count: int, too_wide: float, slope: float, seed: int = 0) -> tuple[
 @pytest.mark.parametrize("too_wide", [0.3, 1.0, 4.0])
 def test_the_scale_of_simulated_errors_is_found(too_wide: float) -> None:
     (beliefs, truth), probability = simulate(300, too_wide, slope=-0.15)
-    found = fit_belief_scale(measure_spread(beliefs, truth, model()), probability)
+    found = fit_belief_scale(
+        measure_spread(beliefs, truth, model()), probability, bare(probability)
+    )
     assert found is not None
     # of 200 particles and the prior of 4 there is a little bias
     assert found.bias == pytest.approx(-math.log(too_wide), abs=0.25)
@@ -80,11 +87,13 @@ def test_sets_and_ellipsoids_of_new_frames_hold_the_truth_as_often_as_they_say(
     too_wide: float,
 ) -> None:
     (beliefs, truth), probability = simulate(120, too_wide, slope=-0.2)
-    scale, _ = fit_beliefs(Beliefs(beliefs, truth), probability, np.ones(120, bool), model())
+    scale, _ = fit_beliefs(
+        Beliefs(beliefs, truth), probability, bare(probability), np.ones(120, bool), model()
+    )
     assert scale is not None
     (new, new_truth), said = simulate(150, too_wide, slope=-0.2, seed=7)
     before = score_truth(new, new_truth, model())
-    after_belief, _ = calibrate_belief(new, said, scale, model())
+    after_belief, _ = calibrate_belief(new, said, bare(said), scale, model())
     after = score_truth(after_belief, new_truth, model())
     assert float(after.log_density.mean()) > float(before.log_density.mean()) + 1
     error = math.sqrt(0.25 / 150)
@@ -106,14 +115,20 @@ def test_a_fit_takes_right_estimates_alone_and_few_of_them_give_none() -> None:
     right = np.arange(40) < 30
     far = truth.clone()
     far[30:, 2, 3] += 1.0
-    with_wrong, score = fit_beliefs(Beliefs(beliefs, far), probability, right, model())
+    with_wrong, score = fit_beliefs(
+        Beliefs(beliefs, far), probability, bare(probability), right, model()
+    )
     without, _ = fit_beliefs(
-        Beliefs(beliefs, truth).select(np.arange(30)), probability[:30], right[:30], model()
+        Beliefs(beliefs, truth).select(np.arange(30)),
+        probability[:30],
+        bare(probability)[:30],
+        right[:30],
+        model(),
     )
     assert with_wrong == without
     assert np.median(score[30:]) > np.median(score[:30]) + 5
     few = np.arange(40) < 9
-    none, plain = fit_beliefs(Beliefs(beliefs, truth), probability, few, model())
+    none, plain = fit_beliefs(Beliefs(beliefs, truth), probability, bare(probability), few, model())
     assert none is None
     own = score_truth(beliefs, truth, model()).nonconformity.numpy()
     assert plain == pytest.approx(own)
@@ -125,7 +140,7 @@ def test_no_frame_is_judged_by_a_scale_that_has_seen_it() -> None:
     other[0, 0, 3] += 0.02
     all_right = np.ones(25, bool)
     a, b = (
-        fit_beliefs(Beliefs(beliefs, one), probability, all_right, model())[1]
+        fit_beliefs(Beliefs(beliefs, one), probability, bare(probability), all_right, model())[1]
         for one in (truth, other)
     )
     # the four others of the frame's own part are calibrated by the same fit as before
@@ -151,11 +166,11 @@ def test_draws_have_the_moments_of_the_distribution_and_are_always_the_same() ->
 def test_the_covariance_about_the_estimate_is_that_of_the_model() -> None:
     (beliefs, truth), probability = simulate(3, 2.0, slope=0)
     scale = BeliefScale(bias=-0.5, slope=-0.1)
-    out, _ = calibrate_belief(beliefs, probability, scale, model())
+    out, _ = calibrate_belief(beliefs, probability, bare(probability), scale, model())
     assert torch.equal(out.best, beliefs.best)
     assert torch.equal(out.score, beliefs.score)
     scatter = measure_spread(beliefs, truth, model()).scatter
-    factor = scale.find_factor(probability)
+    factor = scale.find_factor(probability, bare(probability))
     for i in range(3):
         weights = out.log_weights[i].exp()
         own = Belief(out.poses[i].numpy(), weights.numpy(), CENTER.numpy(), RADIUS, DIAMETER)
@@ -173,7 +188,7 @@ def test_hypotheses_elsewhere_keep_their_poses_and_their_mass() -> None:
     poses[0, :60] = poses[0, :60] @ half_turn
     log_weights[0, :60] = math.log(2)
     given = beliefs._replace(poses=poses, log_weights=log_weights.log_softmax(1))
-    out, _ = calibrate_belief(given, probability, BeliefScale(0.0, 0.0), model())
+    out, _ = calibrate_belief(given, probability, bare(probability), BeliefScale(0.0, 0.0), model())
     weights = out.log_weights[0].exp()
     kept = (out.poses[0, :, None] - poses[0, None, :60]).abs().amax((2, 3)).amin(1) < 1e-12
     mass = 120 / 260
@@ -186,7 +201,7 @@ def test_hypotheses_elsewhere_keep_their_poses_and_their_mass() -> None:
     group[1, :3, 3] = CENTER - half_turn[:3, :3] @ CENTER
     poses[0, :60] = beliefs.poses[0, :60] @ group[1]
     same, _ = calibrate_belief(
-        given._replace(poses=poses), probability, BeliefScale(0, 0), model(group)
+        given._replace(poses=poses), probability, bare(probability), BeliefScale(0, 0), model(group)
     )
     centers = same.poses[0, :, :3, :3] @ CENTER + same.poses[0, :, :3, 3]
     away = (same.poses[0, :, :3, :3].mT @ given.best[0, :3, :3]).diagonal(dim1=1, dim2=2).sum(1)
@@ -199,7 +214,7 @@ def test_of_a_continuous_symmetry_any_turn_is_as_dense() -> None:
     angle = torch.arange(36, dtype=torch.float64)[:, None] * math.radians(10)
     rotation = exp_so3(angle * torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64))
     bowl = model(make_pose(rotation, CENTER - rotation @ CENTER))
-    out, _ = calibrate_belief(beliefs, probability, BeliefScale(0.0, 0.0), bowl)
+    out, _ = calibrate_belief(beliefs, probability, bare(probability), BeliefScale(0.0, 0.0), bowl)
     half = exp_so3(torch.tensor([0.0, 0.0, math.radians(5)], dtype=torch.float64))
     between = beliefs.best @ make_pose(half, CENTER - half @ CENTER)
     at, beside = (score_truth(out, one, bowl) for one in (beliefs.best, between))
@@ -213,7 +228,9 @@ def test_one_particle_and_none_near_the_estimate_become_a_belief_about_it() -> N
         poses = best[:, None].clone()
         poses[0, 0, 2, 3] += shift
         lone = BeliefBatch(poses, torch.zeros(1, 1), best, torch.zeros(1))
-        out, _ = calibrate_belief(lone, torch.ones(1), BeliefScale(0.0, 0.0), model())
+        out, _ = calibrate_belief(
+            lone, torch.ones(1), bare(torch.ones(1)), BeliefScale(0.0, 0.0), model()
+        )
         assert out.poses.shape == (1, 200, 4, 4)
         assert out.poses.dtype == torch.float32
         weights = out.log_weights[0].exp()
@@ -230,13 +247,15 @@ def test_where_an_estimate_is_not_finite_the_particles_stay() -> None:
     log_weights = torch.full((12, 200), -1e9, dtype=torch.float64)
     log_weights[:, 3], log_weights[:, 7] = math.log(0.25), math.log(0.75)
     given = beliefs._replace(best=best, log_weights=log_weights)
-    out, _ = calibrate_belief(given, probability, BeliefScale(0.0, 0.0), model())
+    out, _ = calibrate_belief(given, probability, bare(probability), BeliefScale(0.0, 0.0), model())
     assert torch.equal(out.poses[1, :50], beliefs.poses[1, [3]].expand(50, 4, 4))
     assert torch.equal(out.poses[1, 50:], beliefs.poses[1, [7]].expand(150, 4, 4))
     assert float(out.log_weights.exp().sum(1).sub(1).abs().max()) < 1e-9
     # one does not keep the others from being calibrated
     right = np.arange(12) != 1
-    scale, surprise = fit_beliefs(Beliefs(given, truth), probability, right, model())
+    scale, surprise = fit_beliefs(
+        Beliefs(given, truth), probability, bare(probability), right, model()
+    )
     assert scale is not None
     assert np.isfinite(surprise).all()
 
@@ -260,7 +279,7 @@ def test_ten_frames_do_not_take_a_fit_far_from_what_is_known_of_other_objects() 
     spread = PoseSpread(
         torch.zeros(10, 6, dtype=torch.float64), torch.eye(6, dtype=torch.float64).expand(10, 6, 6)
     )
-    found = fit_belief_scale(spread, torch.full((10,), 0.5))
+    found = fit_belief_scale(spread, torch.full((10,), 0.5), torch.zeros(10, 2))
     assert found is not None
     # minus log posterior: 60 bias + ((bias + 0.2) / 0.5)^2 / 2, and of the slope its prior alone
     assert found.bias == pytest.approx(-0.2 - 60 * 0.5**2, abs=1e-3)
@@ -270,7 +289,22 @@ def test_ten_frames_do_not_take_a_fit_far_from_what_is_known_of_other_objects() 
 def test_the_factor_is_limited_to_what_frames_can_tell() -> None:
     scale = BeliefScale(0.1, -0.2)
     said = torch.tensor([0.0, 0.5, 1.0])
-    assert scale.find_factor(said).log().tolist() == pytest.approx([1.1, 0.1, -0.9])
+    assert scale.find_factor(said, bare(said)).log().tolist() == pytest.approx([1.1, 0.1, -0.9])
+
+
+def test_what_speaks_for_an_estimate_tells_how_wide_its_belief_is() -> None:
+    """Errors that shrink with a feature, which says nothing of whether the pose is right."""
+    (beliefs, truth), probability = simulate(300, 1.0, slope=0)
+    told = torch.linspace(-1.5, 1.5, 300, dtype=torch.float64)[:, None] * torch.tensor([1.0, 0.0])
+    spread = measure_spread(beliefs, truth, model())
+    spread = spread._replace(twist=spread.twist * (-0.4 * told[:, :1]).exp())
+    found = fit_belief_scale(spread, probability, told)
+    assert found is not None
+    assert found.weights == pytest.approx((-0.4, 0.0), abs=0.08)
+    factor = found.find_factor(torch.full((2,), 0.5), torch.tensor([[1.0, 0.0], [-1.0, 9.0]]))
+    assert float((factor[1] / factor[0]).log()) == pytest.approx(0.8, abs=0.2)
+    far = found.find_factor(torch.zeros(2), torch.tensor([[99.0, 0.0], [-99.0, 0.0]]))
+    assert far.log().tolist() == [-2.0, 2.0]
 
 
 def calibration(belief_scale: BeliefScale | None) -> Calibration:
@@ -288,7 +322,9 @@ def test_the_factor_goes_by_the_default_tolerance_whatever_the_verdict_goes_by()
     method = SimpleNamespace(calibration=own, object_model=model())
     elsewhere = found._replace(probability=torch.zeros(2))  # of a stricter tolerance
     out, _ = PoseEstimator.calibrate_belief(method, beliefs, elsewhere)  # type: ignore[arg-type]
-    wanted, _ = calibrate_belief(beliefs, found.probability, BeliefScale(-0.5, -0.3), model())
+    wanted, _ = calibrate_belief(
+        beliefs, found.probability, bare(found.probability), BeliefScale(-0.5, -0.3), model()
+    )
     assert torch.equal(out.poses, wanted.poses)
     assert not torch.equal(out.poses[0], beliefs.poses[0])
     for plain, known in ((calibration(None), found), (own, None)):
@@ -299,7 +335,11 @@ def test_the_factor_goes_by_the_default_tolerance_whatever_the_verdict_goes_by()
 
 def test_a_scale_is_stored_and_read_and_older_calibrations_have_none() -> None:
     plain = calibration(BeliefScale(-0.25, -0.125)).to_plain()
-    assert plain["belief_scale"] == {"bias": -0.25, "slope": -0.125}
+    assert plain["belief_scale"] == {"bias": -0.25, "slope": -0.125, "weights": []}
+    assert read_calibration(plain, "x").belief_scale == BeliefScale(-0.25, -0.125)
+    plain = calibration(BeliefScale(-0.25, -0.125, (0.5,))).to_plain()
+    assert read_calibration(plain, "x").belief_scale == BeliefScale(-0.25, -0.125, (0.5,))
+    del plain["belief_scale"]["weights"]  # of an earlier version
     assert read_calibration(plain, "x").belief_scale == BeliefScale(-0.25, -0.125)
     del plain["belief_scale"]
     assert read_calibration(plain, "x").belief_scale is None
@@ -316,6 +356,10 @@ def test_a_scale_is_stored_and_read_and_older_calibrations_have_none() -> None:
         {"bias": 0.0, "slope": -1e5},
         {"bias": "0", "slope": 0.0},
         {"bias": True, "slope": 0.0},
+        {"bias": 0.0, "slope": 0.0, "weights": 1.0},
+        {"bias": 0.0, "slope": 0.0, "weights": [0.0, 0.0]},
+        {"bias": 0.0, "slope": 0.0, "weights": [math.inf]},
+        {"bias": 0.0, "slope": 0.0, "weights": [20.0]},
     ],
 )
 def test_a_scale_that_is_none_is_refused(content: object) -> None:
@@ -332,7 +376,9 @@ def open_belief(beliefs: BeliefBatch, draws: Tensor) -> Belief:
 
 def test_draws_are_one_mode_however_wide_and_the_uncertainty_is_of_the_estimate() -> None:
     (beliefs, _), probability = simulate(1, 1.0, slope=0)
-    wide, draws = calibrate_belief(beliefs, probability, BeliefScale(1.5, 0.0), model())
+    wide, draws = calibrate_belief(
+        beliefs, probability, bare(probability), BeliefScale(1.5, 0.0), model()
+    )
     belief = open_belief(wide, draws)
     assert belief.draws == 200
     assert len(belief.modes) == 1
@@ -347,7 +393,11 @@ def test_draws_are_one_mode_however_wide_and_the_uncertainty_is_of_the_estimate(
     poses = beliefs.poses.clone()
     poses[0, 30:, 0, 3] += 0.3
     away, draws = calibrate_belief(
-        beliefs._replace(poses=poses), probability, BeliefScale(0.0, 0.0), model()
+        beliefs._replace(poses=poses),
+        probability,
+        bare(probability),
+        BeliefScale(0.0, 0.0),
+        model(),
     )
     belief = open_belief(away, draws)
     assert belief.draws == 32
@@ -368,7 +418,9 @@ def test_draws_survive_a_file_and_another_frame_and_are_none_of_a_fused_belief(
     tmp_path: Path,
 ) -> None:
     (beliefs, _), probability = simulate(1, 1.0, slope=0)
-    belief = open_belief(*calibrate_belief(beliefs, probability, BeliefScale(0, 0), model()))
+    belief = open_belief(
+        *calibrate_belief(beliefs, probability, bare(probability), BeliefScale(0, 0), model())
+    )
     belief.save(tmp_path / "belief.npz")
     assert Belief.load(tmp_path / "belief.npz").draws == 200
     assert belief.transform(np.eye(4)).draws == 200

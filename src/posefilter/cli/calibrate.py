@@ -35,6 +35,7 @@ from posefilter.confidence.fit import (
     fit_calibration,
     fit_choice,
     make_frames,
+    standardize_frames,
 )
 from posefilter.confidence.second_look import look_again
 from posefilter.confidence.tolerance import PoseErrors, measure_pose_errors
@@ -211,8 +212,9 @@ def learn(
     quality = {key: float(scores[key]) for key in _SHOWN if math.isfinite(scores[key])}
     own = frames.present
     nonconformity = np.full(len(own), np.nan)
+    features = torch.from_numpy(standardize_frames(frames, first)[own])
     scale, nonconformity[own] = fit_beliefs(
-        beliefs, held.probability[own], frames.correct[own], method.object_model
+        beliefs, held.probability[own], features, frames.correct[own], method.object_model
     )
     frames = frames._replace(nonconformity=nonconformity)
     return fit_calibration(frames, source, quality, first, scale)
@@ -221,6 +223,7 @@ def learn(
 def fit_beliefs(
     beliefs: Beliefs,
     probability: Tensor,
+    features: Tensor,
     right: np.ndarray,
     object_model: ObjectModel,
     folds: int = 5,
@@ -231,6 +234,7 @@ def fit_beliefs(
     Args:
         beliefs: Of n frames.
         probability: (n,) of each, by a calibration that has not seen it.
+        features: (n, F) of each, standardized.
         right: (n,) bool, whether the estimate is right.
         object_model: The object.
         folds: Each frame's belief is calibrated by a fit to the other parts, or to all where these
@@ -245,7 +249,8 @@ def fit_beliefs(
 
     def fit(index: np.ndarray) -> BeliefScale | None:
         index = index[right[index]]
-        return fit_belief_scale(PoseSpread(*(x[index] for x in spread)), probability[index])
+        own = PoseSpread(*(x[index] for x in spread))
+        return fit_belief_scale(own, probability[index], features[index])
 
     fold = np.random.default_rng(seed).permutation(len(right)) % folds
     nonconformity = np.full(len(right), np.nan)
@@ -257,7 +262,8 @@ def fit_beliefs(
         own, truth = beliefs.select(held)
         scale = None if whole is None else fit(np.flatnonzero(fold != k)) or whole
         if scale is not None:
-            own, _ = calibrate_belief(own, probability[held], scale, object_model)
+            told = probability[held], features[held]
+            own, _ = calibrate_belief(own, *told, scale, object_model)
         nonconformity[held] = score_truth(own, truth, object_model).nonconformity.numpy()
     return whole, nonconformity
 

@@ -1,15 +1,17 @@
-"""The calibrated belief: how far a right estimate is off, by the particles and the probability.
+"""The calibrated belief: how far a right estimate is off, by the particles and what speaks for it.
 
 The particles of a finished filter surround the estimate, and their second moment C about it says in
 which directions it is uncertain.  Its size is that of the filter's last noise level rather than of
 the estimate's error: refinements move the estimate and not the particles.  The calibration frames
 tell the size.  The error of a right estimate, a twist e (6,), is modeled as Student's t:
 
-    e ~ t_5(0, s^2 C),    log s = bias + slope * logit(probability)
+    e ~ t_5(0, s^2 C),    log s = bias + slope * logit(probability) + weights . features
 
-with two numbers, `bias` and `slope`, which maximize the posterior over the frames whose estimate is
-right.  A calibrated belief has draws of this distribution about the estimate in place of the
-particles that are near it; particles elsewhere are other hypotheses, and stay.
+with numbers that maximize the posterior over the frames whose estimate is right.  The features are
+those of the calibration, standardized by it: by the probability alone beliefs would be as wide as
+they should be over all images, and too narrow where the object is occluded.  A calibrated belief
+has draws of this distribution about the estimate in place of the particles that are near it;
+particles elsewhere are other hypotheses, and stay.
 
 So the belief says where the pose is *if the estimate is right*; `probability` says whether it is.
 """
@@ -32,6 +34,9 @@ _DEGREES = 5.0  # of freedom: of 3, 5 and 8 the densest at held-out errors of te
 _LOGIT = 5.0  # beyond, on either side, frames are too few to tell more
 # mean and standard deviation of the prior, near the mean and the spread of ten objects' own fits
 _BIAS, _SLOPE = (-0.2, 0.5), (-0.2, 0.1)
+_WEIGHT = 0.1  # standard deviation of the prior of a weight, times that of its feature
+_LEAST_SPREAD = 0.05  # of a feature: one that is nearly constant tells nothing
+_MOST = 2.0  # of the log of the factor: features beyond those that were seen say no more
 # before any particle an error of so many diameters, a turn as the shift at the radius, counts as
 # much as so many particles: C has full rank also where few are near the estimate
 _PRIOR_ERROR, _PRIOR_COUNT = 0.03, 4.0
@@ -47,14 +52,24 @@ class BeliefScale:
     Attributes:
         bias: Log of the factor at a probability of one half.
         slope: By how much it rises with the probability's logit.
+        weights: By how much it rises with each standardized feature; none: of an earlier version.
     """
 
     bias: float
     slope: float
+    weights: tuple[float, ...] = ()
 
-    def find_factor(self, probability: Tensor) -> Tensor:
-        """Return the factor of estimates with a probability of being right, (B,) -> (B,)."""
-        return (self.bias + self.slope * _limit_logit(probability)).exp()
+    def find_factor(self, probability: Tensor, features: Tensor) -> Tensor:
+        """Return the factors of B estimates.
+
+        Args:
+            probability: (B,) that each is right.
+            features: (B, F), standardized; F may be anything where there are no weights.
+        """
+        log_factor = self.bias + self.slope * _limit_logit(probability)
+        if self.weights:
+            log_factor = log_factor + features.double() @ log_factor.new_tensor(self.weights)
+        return log_factor.clamp(-_MOST, _MOST).exp()
 
 
 class PoseSpread(NamedTuple):
@@ -83,41 +98,54 @@ def measure_spread(belief: BeliefBatch, truth: Tensor, object_model: ObjectModel
     return PoseSpread(torch.stack(twists), torch.stack(scatters))
 
 
-def fit_belief_scale(spread: PoseSpread, probability: Tensor) -> BeliefScale | None:
+def fit_belief_scale(
+    spread: PoseSpread, probability: Tensor, features: Tensor
+) -> BeliefScale | None:
     """Fit the scale to frames whose estimate is right; None where they are too few.
 
     Args:
         spread: Of n frames, see `measure_spread`.
         probability: (n,) of each, by a calibration that has not seen it.
+        features: (n, F) of each, standardized.
     """
     from scipy.optimize import minimize  # slow to import, prediction needs none
 
     if len(probability) < FEWEST_RIGHT:
         return None
-    logit = _limit_logit(probability).numpy()
+    told = torch.cat([_limit_logit(probability)[:, None], features.double()], dim=1).numpy()
+    x = np.concatenate([np.ones((len(told), 1)), told], axis=1)
     within = torch.linalg.solve(spread.scatter, spread.twist[..., None])[..., 0]
     distance = (within * spread.twist).sum(-1).numpy()  # squared, of Mahalanobis
-    mean, deviation = (np.array(x) for x in zip(_BIAS, _SLOPE, strict=True))
+    mean = np.array([_BIAS[0], _SLOPE[0], *[0.0] * features.shape[1]])
+    varied = x[:, 2:].std(axis=0).clip(_LEAST_SPREAD)
+    deviation = np.concatenate([[_BIAS[1], _SLOPE[1]], _WEIGHT / varied])
 
-    def negative_log_posterior(x: np.ndarray) -> float:
-        """Return it up to a constant, of bias and slope."""
-        log_factor = x[0] + x[1] * logit
-        tail = np.log1p(distance * np.exp(-2 * log_factor) / _DEGREES)
-        own = 6 * log_factor + 0.5 * (_DEGREES + 6) * tail
-        return float(own.sum() + 0.5 * np.square((x - mean) / deviation).sum())
+    def negative_log_posterior(w: np.ndarray) -> tuple[float, np.ndarray]:
+        """Return it up to a constant, and its gradient."""
+        log_factor = x @ w
+        ratio = distance * np.exp(-2 * log_factor) / _DEGREES
+        own = 6 * log_factor + 0.5 * (_DEGREES + 6) * np.log1p(ratio)
+        slopes = 6 - (_DEGREES + 6) * ratio / (1 + ratio)
+        away = (w - mean) / deviation
+        return float(own.sum() + 0.5 * np.square(away).sum()), slopes @ x + away / deviation
 
-    bias, slope = minimize(negative_log_posterior, mean, method="Nelder-Mead").x
-    return BeliefScale(float(bias), float(slope))
+    found = minimize(negative_log_posterior, mean, jac=True, method="BFGS").x
+    return BeliefScale(float(found[0]), float(found[1]), tuple(found[2:].tolist()))
 
 
 def calibrate_belief(
-    belief: BeliefBatch, probability: Tensor, scale: BeliefScale, object_model: ObjectModel
+    belief: BeliefBatch,
+    probability: Tensor,
+    features: Tensor,
+    scale: BeliefScale,
+    object_model: ObjectModel,
 ) -> tuple[BeliefBatch, Tensor]:
     """Return beliefs that are as wide as the errors of right estimates are.
 
     Args:
         belief: B beliefs, as a filter leaves them.
         probability: (B,) that the estimate is right.
+        features: (B, F) of each, standardized.
         scale: Of the calibration.
         object_model: The object.
 
@@ -127,7 +155,7 @@ def calibrate_belief(
         estimate is not finite they are the particles alone.  And of each, how many of the first
         poses are draws about the estimate, (B,) int64.
     """
-    factors = scale.find_factor(probability.detach().cpu())
+    factors = scale.find_factor(probability.detach().cpu(), features.detach().cpu())
     count = max(belief.log_weights.shape[1], _FEWEST_PARTICLES)
     rows = [
         _redraw(belief, i, float(factor), count, object_model) for i, factor in enumerate(factors)

@@ -158,7 +158,11 @@ class Calibration:
         """
         if self.choice is None:
             raise UserError("calibration: compares no answers; calibrate the checkpoint again")
-        return _evaluate(self.choice, self._standardize(self._stack(values)))
+        return _evaluate(self.choice, self.standardize(values))
+
+    def standardize(self, values: Mapping[str, Tensor]) -> Tensor:
+        """Return features (B,) by name as the regressions take them, (B, F) float64."""
+        return self._standardize(self._stack(values))
 
     def _stack(self, values: Mapping[str, Tensor]) -> Tensor:
         """Return features (B, F), in the order of `features`."""
@@ -273,7 +277,7 @@ def _read(content: Any) -> Calibration:
         _conformal(content.get("conformal")),
         None if content.get("choice") is None else _logistic(content["choice"], count, "choice"),
         _errors(content.get("errors"), count),
-        _belief_scale(content.get("belief_scale")),
+        _belief_scale(content.get("belief_scale"), count),
     )
 
 
@@ -284,15 +288,20 @@ def _logistic(content: Any, count: int, name: str) -> Logistic:
     return Logistic(weights, _numbers([content["bias"]], 1, f"{name}'s bias")[0])
 
 
-def _belief_scale(content: Any) -> BeliefScale | None:
+def _belief_scale(content: Any, count: int) -> BeliefScale | None:
     if content is None:
         return None
-    if not isinstance(content, dict) or set(content) != {"bias", "slope"}:
-        raise ValueError("should have bias and slope in belief_scale")
-    both = _numbers([content["bias"], content["slope"]], 2, "belief_scale", minimum=-_MOST_LOG)
-    if max(both) > _MOST_LOG:
+    # earlier versions have no weights
+    if not isinstance(content, dict) or set(content) - {"weights"} != {"bias", "slope"}:
+        raise ValueError("should have bias, slope and weights in belief_scale")
+    weights = content.get("weights", [])
+    if not isinstance(weights, list) or len(weights) not in (0, count):
+        raise ValueError(f"should have {count} weights in belief_scale")
+    given = [content["bias"], content["slope"], *weights]
+    numbers = _numbers(given, len(given), "belief_scale", minimum=-_MOST_LOG)
+    if max(numbers) > _MOST_LOG:
         raise ValueError("has numbers out of range in belief_scale")
-    return BeliefScale(*both)
+    return BeliefScale(numbers[0], numbers[1], numbers[2:])
 
 
 def _errors(content: Any, count: int) -> CalibrationErrors | None:

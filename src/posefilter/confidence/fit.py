@@ -75,9 +75,7 @@ def fit_choice(frames: Frames, source: str) -> Calibration:
     fitted = _fit(frames, source, {})
     share = float(np.clip(frames.correct.mean(), 0.05, 0.95))
     balance = np.where(frames.correct, 0.5 / share, 0.5 / (1 - share))
-    return replace(
-        fitted, choice=fit_logistic(_standardize(frames, fitted), frames.correct, balance)
-    )
+    return replace(fitted, choice=fit_logistic(standardize_frames(frames), frames.correct, balance))
 
 
 def fit_calibration(
@@ -137,19 +135,11 @@ def _fit(
         "absent": int((~there).sum()),
     }
     none = Logistic((0.0,) * len(frames.features), 0.0)
-    out = Calibration(
-        frames.features,
-        tuple(np.nanmean(frames.values, 0).tolist()),
-        tuple(np.nanstd(frames.values, 0).clip(1e-6).tolist()),
-        none,
-        none,
-        counts,
-        source,
-        dict(quality),
-    )
+    center, scale = _find_standard(frames, first)
+    out = Calibration(frames.features, center, scale, none, none, counts, source, dict(quality))
     if first is not None:
-        out = replace(out, center=first.center, scale=first.scale, choice=first.choice)
-    x = _standardize(frames, out)
+        out = replace(out, choice=first.choice)
+    x = standardize_frames(frames, first)
     share = there.mean()
     balance = np.where(there, 0.5 / share, 0.5 / (1 - share))
     errors = None
@@ -163,9 +153,21 @@ def _fit(
     )
 
 
-def _standardize(frames: Frames, calibration: Calibration) -> np.ndarray:
-    """Return the features as a calibration standardizes them, (n, F)."""
-    return standardize(frames.values, calibration.center, calibration.scale)
+def standardize_frames(frames: Frames, first: Calibration | None = None) -> np.ndarray:
+    """Return the features as the calibration of these frames standardizes them, (n, F); `first` as
+    of `fit_calibration`.
+    """
+    return standardize(frames.values, *_find_standard(frames, first))
+
+
+def _find_standard(
+    frames: Frames, first: Calibration | None
+) -> tuple[tuple[float, ...], tuple[float, ...]]:
+    """Return center and scale of the features."""
+    if first is not None:
+        return first.center, first.scale
+    scale = np.nanstd(frames.values, 0).clip(1e-6)
+    return tuple(np.nanmean(frames.values, 0).tolist()), tuple(scale.tolist())
 
 
 def cross_validate(

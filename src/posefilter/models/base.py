@@ -302,7 +302,9 @@ class PoseEstimator(Module):
             return belief, None
         assert found.features is not None
         right = self.calibration.assess(found.features).probability  # within the default tolerance
-        return calibrate_belief(belief, right, self.calibration.belief_scale, self.object_model)
+        features = self.calibration.standardize(found.features)
+        scale = self.calibration.belief_scale
+        return calibrate_belief(belief, right, features, scale, self.object_model)
 
     # -- training ---------------------------------------------------------------------------------
 
