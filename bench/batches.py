@@ -22,7 +22,7 @@ from torch.utils.flop_counter import FlopCounterMode
 
 import posefilter
 from posefilter.data.readers.registry import open_meshes, open_reader
-from posefilter.data.sequences import SceneVideo, VideoFrame, list_groups
+from posefilter.data.sequences import SceneVideo, VideoFrame, list_scenes
 from posefilter.memory import keep_freed_memory
 from posefilter.nets.layers import fast_bfloat16
 
@@ -129,7 +129,7 @@ def main() -> None:
     names = [options.only]
     meshes = open_meshes(options.meshes, None, "ycb_video", names)
     reader = open_reader("ycb_video", options.frames, names, meshes, subsets=["data"])
-    frames = [frame for group in list_groups(reader) for frame in SceneVideo(reader, group, names)]
+    frames = [frame for scene in list_scenes(reader) for frame in SceneVideo(reader, scene, names)]
     frames = [frame for frame in frames if options.only in frame.truth][: options.size]
     estimator = posefilter.load(options.only, device="cpu")
     first = frames[0]

@@ -17,7 +17,7 @@ import torch
 
 import posefilter
 from posefilter.data.readers.registry import open_meshes, open_reader
-from posefilter.data.sequences import SceneVideo
+from posefilter.data.sequences import SceneVideo, list_scenes
 from posefilter.metrics.errors import add
 from posefilter.metrics.scores import auc
 
@@ -49,7 +49,8 @@ def main() -> None:
     poses: dict[str, list[np.ndarray]] = {name: [] for name in WAYS}
     seconds: dict[str, list[float]] = {name: [] for name in WAYS}
     truth = []
-    for frame in SceneVideo(reader, typed.scene, [model.name], typed.stride):
+    scene = next(one for one in list_scenes(reader) if one.name == typed.scene)
+    for frame in SceneVideo(reader, scene, [model.name], typed.stride):
         if model.name not in frame.truth:
             continue
         truth.append(frame.truth[model.name])

@@ -19,7 +19,7 @@ from marked import format_row
 
 import posefilter
 from posefilter.data.readers.registry import open_meshes, open_reader
-from posefilter.data.sequences import SceneVideo, VideoFrame, list_groups
+from posefilter.data.sequences import SceneVideo, VideoFrame, list_scenes
 from posefilter.meshes.mesh import Mesh, diameter
 from posefilter.metrics.errors import add, add_s
 from posefilter.metrics.scores import auc
@@ -142,13 +142,13 @@ def measure(
     store = open_meshes(meshes, None, "ycb_video", list(names))
     reader = open_reader("ycb_video", frames, list(names), store, subsets=["data"])
     rows: list[tuple[list[str], dict[str, Any]]] = []
-    for group in list_groups(reader):
-        video = SceneVideo(reader, group, names)
+    for scene in list_scenes(reader):
+        video = SceneVideo(reader, scene, names)
         every = list(video)
         for name in video.objects or ():
             begun = time.monotonic()
             judged = compare(program, name, store.load(name), every, folder)
-            rows.append(([name, group, str(len(every))], judged))
+            rows.append(([name, video.name, str(len(every))], judged))
             print(name, judged, f"{time.monotonic() - begun:.0f} s", flush=True)
     tables = []
     for title, head, column, digits in (

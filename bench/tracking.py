@@ -39,7 +39,7 @@ from marked import put_table, read_rows
 
 import posefilter
 from posefilter.data.readers.registry import open_meshes, open_reader
-from posefilter.data.sequences import SceneVideo, VideoFrame, list_groups
+from posefilter.data.sequences import SceneVideo, VideoFrame, list_scenes
 from posefilter.memory import keep_freed_memory
 from posefilter.meshes import ycb
 from posefilter.metrics.credibility import SHOWN
@@ -359,15 +359,15 @@ def run_together(options: argparse.Namespace, names: Sequence[str]) -> None:
     for folder in options.sequences or [options.frames]:
         parts = {} if options.sequences else {"parts": ["data"]}
         reader = open_reader(kind, folder, None if options.sequences else names, meshes, **parts)
-        for group in list_groups(reader):
-            video = SceneVideo(reader, group, names)
+        for one in list_scenes(reader):
+            video = SceneVideo(reader, one, names)
             frames, there = list(video), video.objects or ()
-            if not there or options.scene not in (None, group):
+            if not there or options.scene not in (None, video.name):
                 continue
             order = sorted(names, key=lambda name: name not in there)
             for count in options.together:
                 chosen = [loaded[name] for name in order[:count]]
-                scene = Path(folder).name if options.sequences else group
+                scene = Path(folder).name if options.sequences else video.name
                 for line in measure_together(chosen, scene, frames, options.rounds):
                     lines.append(line)
                     print(line, flush=True)
@@ -466,7 +466,7 @@ def open_sequences(
     """Yield of each DIR=OBJECT the object, the folder's name, and its scenes."""
     for folder, name in (pair.rsplit("=", 1) for pair in pairs):
         reader = open_reader("fat", folder, None, open_meshes(meshes, None, "fat", [name]))
-        scenes = [SceneVideo(reader, group, [name]) for group in list_groups(reader)]
+        scenes = [SceneVideo(reader, scene, [name]) for scene in list_scenes(reader)]
         yield name, Path(folder).name, scenes
 
 
@@ -515,18 +515,18 @@ def main() -> None:
         open_meshes(options.meshes, None, "ycb_video", names),
         subsets=["data"],
     )
-    groups = list_groups(reader)
+    scenes = list_scenes(reader)
     if options.beliefs:
-        there = [(group, SceneVideo(reader, group, names).objects or ()) for group in groups]
-        pairs = [(group, name) for group, own in there for name in own]
-        videos = [(name, [SceneVideo(reader, group, [name])]) for group, name in pairs]
+        there = [(scene, SceneVideo(reader, scene, names).objects or ()) for scene in scenes]
+        pairs = [(scene, name) for scene, own in there for name in own]
+        videos = [(name, [SceneVideo(reader, scene, [name])]) for scene, name in pairs]
         run_beliefs(videos, "photographs", options.seeds)
         return
-    every = {group: SceneVideo(reader, group, names) for group in groups}
+    every = {scene.name: SceneVideo(reader, scene, names) for scene in scenes}
     rows, losses = [], []
     for group, video in every.items():
         frames = list(video)
-        other = [frame for one in groups if one != group for frame in every[one]]
+        other = [frame for one in every if one != group for frame in every[one]]
         for name in video.objects or ():
             estimator = posefilter.load(name, device="cpu")
             if not options.losses:

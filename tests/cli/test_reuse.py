@@ -1,11 +1,14 @@
 """Which jobs of a sweep learn the same."""
 
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
+import torch
 
+from posefilter.cli import reuse
 from posefilter.cli.command import compose_job
-from posefilter.cli.reuse import learned_from
+from posefilter.cli.reuse import learned_from, take_over
 
 CONF = Path(__file__).parents[2] / "conf"
 
@@ -35,3 +38,26 @@ def test_training_is_shared_where_no_setting_of_it_differs(
     one = compose_job("train", CONF, common, tmp_path / "one")
     other = compose_job("train", CONF, [*common, *changed], tmp_path / "other")
     assert (learned_from(one) == learned_from(other)) == same
+
+
+def test_what_another_job_has_learned_comes_without_its_calibration(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It is of the other's filter, and only the recipe tells that."""
+    for name in ("0_a", "1_b"):
+        (tmp_path / name / "checkpoints").mkdir(parents=True)
+    other = {"state_dict": {}, "recipe": {"settings": {}}, "calibration": {"features": []}}
+    torch.save(other, tmp_path / "0_a" / "checkpoints" / "best.ckpt")
+    known = {tmp_path / "0_a": {"training": {"learned_from": "this"}}}
+    monkeypatch.setattr(reuse, "own_metrics", lambda folder: known.get(folder, {}))
+    monkeypatch.setattr(reuse, "learned_from", lambda job: "this")
+    monkeypatch.setattr(reuse, "recipe", lambda job: {"settings": {"filter": {"particles": 9}}})
+    monkeypatch.setattr(reuse, "differing", lambda a, b: ["filter.particles"])
+    monkeypatch.setattr(reuse, "read_checkpoint", lambda file: other)
+    job = SimpleNamespace(swept=True, folder=tmp_path / "1_b", cfg=SimpleNamespace(console="json"))
+    assert take_over(job) == {"learned_from": "this", "trained_as": "0_a"}  # type: ignore[arg-type]
+    kept = torch.load(tmp_path / "1_b" / "checkpoints" / "best.ckpt", weights_only=True)
+    assert kept == {
+        "state_dict": {},
+        "recipe": {"settings": {"filter": {"particles": 9}}},
+    }

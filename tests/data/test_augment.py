@@ -145,6 +145,17 @@ def test_an_occluder_is_in_front_and_leaves_enough() -> None:
     assert hidden > 5
 
 
+def test_an_occluder_of_an_image_of_another_size_fits() -> None:
+    x = sample()
+    small = dataclasses.replace(x, rgb=x.rgb[::2, ::3].copy())
+    pasted = 0
+    for seed in range(20):
+        out = PasteOccluder(1.0)(x, lambda rng: small, np.random.default_rng(seed))
+        assert out.rgb.shape == x.rgb.shape
+        pasted += not np.array_equal(out.rgb, x.rgb)
+    assert pasted > 5
+
+
 def test_noise_leaves_holes_alone_and_stays_small() -> None:
     x = sample()
     x.depth[5:9, 5:20] = 0

@@ -126,6 +126,10 @@ def test_a_folder_of_its_own_may_say_its_symmetries(tmp_path: Path) -> None:
     assert len(read) == 4
     quarter = read[1] @ [0.03, 0, 0, 1]
     assert quarter == pytest.approx([0.01, 0.02, 0, 1])  # about the line through the offset
+    del own["symmetries_discrete"]  # as BOP's own entries have it
+    (tmp_path / "024_bowl" / "symmetries.json").write_text(json.dumps(own))
+    again = MeshStore(tmp_path, symmetry_steps=4).load("024_bowl").symmetries
+    assert np.array_equal(again, read)
 
 
 def test_bad_symmetries_are_named(tmp_path: Path) -> None:

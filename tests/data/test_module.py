@@ -211,6 +211,37 @@ def test_disk_cache_is_used_and_renewed(tmp_path, monkeypatch):
     np.testing.assert_array_equal(renewed.mask[0].numpy(), truth(other) > 0)
 
 
+def test_the_disk_cache_is_renewed_when_the_camera_the_meshes_or_their_unit_change(tmp_path):
+    fat_tree(tmp_path / "data", scenes=1, frames=1)
+    mesh = write_mesh(tmp_path / "meshes", "toy") / "toy" / "google_16k" / "textured.obj"
+
+    def read(scale=None):
+        one = PoseDataModule(
+            "fat",
+            tmp_path / "data",
+            "toy",
+            tmp_path / "meshes",
+            mesh_scale=scale,
+            split={"test": 1.0},
+            cache="disk",
+            progress=False,
+        ).test_dataset[0]
+        return float(one.visibility), float(one.intrinsics[0, 0])
+
+    first = read()
+    assert read() == first
+    assert read(scale=3.0)[0] < 0.5 * first[0]
+    assert read() == first
+    camera = tmp_path / "data" / "mixed" / "kitchen_0" / "_camera_settings.json"
+    camera.write_text(camera.read_text().replace(f'"fx": {K[0, 0]}', f'"fx": {1.5 * K[0, 0]}'))
+    assert read()[1] == pytest.approx(1.5 * first[1])
+    lines = [line.split() for line in mesh.read_text().splitlines()]
+    bigger = (" ".join([x, *(str(3 * float(y)) for y in z)]) for x, *z in lines if x == "v")
+    faces = (" ".join(line) for line in lines if line[0] == "f")
+    mesh.write_text("\n".join([*bigger, *faces]) + "\n")
+    assert read()[0] < 0.5 * first[0]
+
+
 def test_visibility_filters_training_and_test_apart(tmp_path):
     write_mesh(tmp_path / "meshes", "toy")
     front = pose((0.1, 0.2, 0.3), (0.04, -0.02, 0.33))
@@ -452,3 +483,22 @@ def test_a_process_goes_on_in_its_own_share() -> None:
 def test_fewer_frames_than_processes_are_refused() -> None:
     with pytest.raises(UserError, match=r"^trainer.devices=3: there are only 2 training frames"):
         EpochShuffle(2, 5, lambda epoch: None, 0, 3)
+
+
+@pytest.mark.parametrize(
+    "split",
+    [
+        {"train": 0.8, "val": "test", "test": "train"},
+        {"val": "test", "test": "train", "train": 0.8},
+        {"test": "train", "train": 0.8, "val": "test"},
+    ],
+)
+def test_parts_may_name_each_other_in_any_order(root, split):
+    dm = module(root, split=split)
+    assert dm.records("val") == dm.records("test") == dm.records("train") != []
+
+
+def test_parts_that_name_each_other_in_a_circle_are_told(root):
+    split = {"train": 0.8, "val": "test", "test": "val"}
+    with pytest.raises(UserError, match=r"data.split: val and test name each other"):
+        module(root, split=split).records("val")

@@ -13,7 +13,7 @@ from tests.data.test_scenes import library as library
 from tests.data.test_scenes import scene as scene
 
 from posefilter.data.readers.registry import open_reader
-from posefilter.data.sequences import SceneVideo, list_groups
+from posefilter.data.sequences import SceneVideo, list_scenes
 from posefilter.errors import UserError
 from posefilter.synthetic.generate import generate
 from posefilter.synthetic.motion import (
@@ -113,8 +113,8 @@ def test_a_sequence_is_read_in_its_order_and_hides_the_object_for_a_while(sequen
     steps = np.linalg.norm(np.diff(places, axis=0), axis=1)
     assert 0.05 < np.sqrt((steps**2).mean()) < 3
     reader = open_reader("fat", sequence)
-    (group,) = list_groups(reader)
-    frames = list(SceneVideo(reader, group, ["carton"]))
+    (scene,) = list_scenes(reader)
+    frames = list(SceneVideo(reader, scene, ["carton"]))
     assert [frame.im_id for frame in frames] == list(range(14))
     assert [n for n, frame in enumerate(frames) if not frame.truth] == [6, 7]
 

@@ -85,7 +85,9 @@ def take_over(job: Job) -> dict[str, Any] | None:
             continue
         now = recipe(job)
         checkpoint = read_checkpoint(best)
-        save_whole({**checkpoint, "recipe": now}, job.folder / "checkpoints" / "best.ckpt")
+        # a calibration belongs to the filter that it was made with
+        own = {key: value for key, value in checkpoint.items() if key != "calibration"}
+        save_whole({**own, "recipe": now}, job.folder / "checkpoints" / "best.ckpt")
         others = ", ".join(differing(checkpoint["recipe"], now))
         sentence = (
             f"{job.folder.name}: only tested, with what {folder.name} has learned; "

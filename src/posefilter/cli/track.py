@@ -20,8 +20,8 @@ from posefilter.cli.predict import parse_distortion, read_intrinsics
 from posefilter.cli.results import write_json
 from posefilter.cli.shapes import load_shape, open_shapes
 from posefilter.cli.track_log import POSES, TrackLog, check_unused
-from posefilter.data.readers.registry import open_meshes, open_reader
-from posefilter.data.sequences import FolderVideo, SceneVideo, Video, VideoFrame, list_groups
+from posefilter.data.readers.registry import open_meshes, open_whole
+from posefilter.data.sequences import FolderVideo, Scene, SceneVideo, Video, VideoFrame, list_scenes
 from posefilter.errors import Stopped, UserError
 from posefilter.estimator import Estimator
 from posefilter.figures.detections import Drawn, draw_detections
@@ -258,14 +258,14 @@ def open_videos(cfg: DictConfig, objects: Sequence[str]) -> tuple[Sequence[Video
     names = list(objects)
     meshes = open_meshes(data.meshes, data.mesh_scale, data.source, names)
     options = resolve(data.options) or {}
-    reader = open_reader(data.source, data.root, None, meshes, data.on_error, **options)
-    groups = list_groups(reader)
+    reader = open_whole(data.source, data.root, names, meshes, data.on_error, **options)
+    scenes = list_scenes(reader)
     if cfg.scene is not None:
-        known, groups = groups, [one for one in groups if _is_scene(one, cfg.scene)]
-        if not groups:
-            some = ", ".join(known[:5]) + (", ..." if len(known) > 5 else "")
+        known, scenes = scenes, [one for one in scenes if _is_meant(one, cfg.scene)]
+        if not scenes:
+            some = ", ".join(one.name for one in known[:5]) + (", ..." if len(known) > 5 else "")
             raise UserError(f"scene={cfg.scene}: {data.root} has no such scene; it has {some}")
-    videos = [SceneVideo(reader, one, names, cfg.stride) for one in groups]
+    videos = [SceneVideo(reader, one, names, cfg.stride) for one in scenes]
     shown = [video for video in videos if video.objects]
     if not shown:
         raise UserError(
@@ -274,10 +274,13 @@ def open_videos(cfg: DictConfig, objects: Sequence[str]) -> tuple[Sequence[Video
     return shown, reader.native_from_mesh
 
 
-def _is_scene(group: str, scene: Any) -> bool:
-    """Tell whether a scene is meant: by its name, or by its number where that is a number."""
-    same = group.isdigit() and str(scene).isdigit() and int(group) == int(scene)
-    return group == str(scene) or same
+def _is_meant(scene: Scene, asked: Any) -> bool:
+    """Tell whether a scene is meant: by its name, by its place's, or by its number where that is a
+    number.
+    """
+    group, name = scene.group, str(asked)
+    same = group.isdigit() and name.isdigit() and int(group) == int(name)
+    return same or name in (group, scene.name)
 
 
 def list_figures(figures: dict[str, Any]) -> list[tuple[str, str]]:

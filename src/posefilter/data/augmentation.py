@@ -204,8 +204,10 @@ class PasteOccluder:
             return sample
         distance = sample.camera_from_object[2, 3] * rng.uniform(0.72, 0.94)
         surface = distance * (1 - 0.05 * (1 - a * a) + 0.03 * b * rng.normal())
-        # drawn samples have the size of whole images, as this one
-        other = jitter_color(draw(rng).rgb[cut], rng, 1.0)
+        drawn = draw(rng).rgb
+        if drawn.shape != sample.rgb.shape:  # images of several sizes
+            drawn = cv2.resize(drawn, sample.mask.shape[::-1], interpolation=cv2.INTER_AREA)
+        other = jitter_color(drawn[cut], rng, 1.0)
         rgb, depth = sample.rgb.copy(), sample.depth.copy()
         rgb[cut][patch], depth[cut][patch] = other[patch], surface[patch]
         visibility = float(sample.visibility * mask.sum() / sample.mask.sum())

@@ -169,7 +169,10 @@ class PoseDataModule(LightningDataModule):
     def _decoder(self) -> FrameDecoder:
         size = f"{self._image_width}x{self._image_height}"
         options = sorted(self._options.items())
-        content = (self.source, self.root.resolve(), self.objects, self.meshes.root, size, options)
+        root = str(self.meshes.root)
+        root = root if root == BUILTIN else str(Path(root).resolve())
+        meshes = (root, self.meshes.describe_files(self.objects))
+        content = (self.source, self.root.resolve(), self.objects, meshes, size, options)
         folder = Path(self._cache_dir or self.root / ".cache")
         return FrameDecoder(
             self.reader,

@@ -5,7 +5,8 @@ from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from pathlib import Path
+from pathlib import Path, PurePosixPath
+from typing import NamedTuple
 
 import numpy as np
 
@@ -129,23 +130,34 @@ class FolderVideo(Video):
         return VideoFrame(color.stem, number, rgb, z, self._K, {})
 
 
+class Scene(NamedTuple):
+    """What one camera sees of one place: a video. FAT has folders of the same place, and each of
+    two cameras.
+    """
+
+    group: str  # as the records name it
+    scene_id: int
+    name: str  # no other scene's of the dataset: the group, or the images' folder and camera
+
+
 class SceneVideo(Video):
     """A scene of a dataset, with the true poses of the objects that are asked for.
 
     Args:
         reader: Of the dataset.
-        group: The scene, as its records name it.
+        scene: Which of `list_scenes`.
         objects: Whose poses are to be known.
         stride: Take every so many frames.
     """
 
     def __init__(
-        self, reader: BaseReader, group: str, objects: Sequence[str], stride: int = 1
+        self, reader: BaseReader, scene: Scene, objects: Sequence[str], stride: int = 1
     ) -> None:
-        self.name, self._reader, self._wanted = group, reader, set(objects)
+        self.name, self.scene_id = scene.name, scene.scene_id
+        self._reader, self._wanted = reader, set(objects)
         frames: dict[int, list[tuple[int, FrameRecord]]] = {}
         for index, record in enumerate(reader.records()):
-            if record.group == group:
+            if (record.group, record.scene_id) == scene[:2]:
                 frames.setdefault(record.im_id, []).append((index, record))
         self._frames = [frames[number] for number in sorted(frames)][::stride]
         own = [record for frame in self._frames for _, record in frame if record.object in objects]
@@ -155,7 +167,6 @@ class SceneVideo(Video):
         self.ids = {record.object: record.obj_id for record in own}
         counts = Counter((record.im_id, record.object) for record in own)
         self.several = tuple(sorted({name for (_, name), count in counts.items() if count > 1}))
-        self.scene_id = self._frames[0][0][1].scene_id
 
     def __len__(self) -> int:
         """Return the number of frames."""
@@ -181,9 +192,24 @@ class SceneVideo(Video):
         return VideoFrame(record.name, record.im_id, sample.rgb, sample.depth, K, truth)
 
 
-def list_groups(reader: BaseReader) -> list[str]:
+def list_scenes(reader: BaseReader) -> list[Scene]:
     """Return the scenes of a dataset, in the order of their records."""
-    return list(dict.fromkeys(record.group for record in reader.records()))
+    first: dict[tuple[str, int], FrameRecord] = {}
+    for record in reader.records():
+        first.setdefault((record.group, record.scene_id), record)
+    many = Counter(group for group, _ in first)
+    return [
+        Scene(*key, key[0] if many[key[0]] == 1 else _name_of_folder(record.name))
+        for key, record in first.items()
+    ]
+
+
+def _name_of_folder(image: str) -> str:
+    """Return the folder of an image and the camera: mixed/kitchen_0.left of
+    mixed/kitchen_0/000001.left.
+    """
+    path = PurePosixPath(image)
+    return f"{path.parent}{path.suffix}"
 
 
 def number_names(names: Sequence[str]) -> list[int] | None:

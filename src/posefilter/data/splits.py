@@ -82,10 +82,22 @@ def split_records(
     for i, part in left:
         if part is not None:
             out[part].append(i)
-    for name, share in split.items():
-        if isinstance(share, str) and share in NAMES:
-            out[name] = out[share]
+    for name in split:
+        out[name] = out[_follow(name, split)]
     return out
+
+
+def _follow(name: str, split: Mapping[str, Share | None]) -> str:
+    """Return the part whose frames a part has: itself, or the one that it names, and so on.
+
+    Raises UserError where parts name each other.
+    """
+    passed = [name]
+    while isinstance(share := split.get(passed[-1]), str) and share in NAMES:
+        if share in passed:
+            raise UserError(f"data.split: {' and '.join(passed)} name each other, and no frames")
+        passed.append(share)
+    return passed[-1]
 
 
 def _image(record: FrameRecord) -> tuple[str, int]:

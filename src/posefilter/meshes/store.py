@@ -2,7 +2,7 @@
 
 import difflib
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -77,6 +77,18 @@ class MeshStore:
     def names(self) -> list[str]:
         """Return the names of all meshes, sorted."""
         return builtin.names() if str(self.root) == BUILTIN else sorted(self._files)
+
+    def describe_files(self, names: Sequence[str]) -> str:
+        """Return what changes when a file that decides the shape of one of some meshes does, or
+        the unit.
+        """
+        whole = [name if name in self._files else split_part(name)[0] for name in names]
+        own = [name for name in dict.fromkeys(whole) if name in self._files]
+        meshes = [self._files[name] for name in own]
+        beside = [folder / FILE for name in own for folder in self._folders_of(name)]
+        found = [path.stat() for path in (*meshes, *beside) if path.is_file()]
+        states = [f"{state.st_size}:{state.st_mtime_ns}" for state in found]
+        return " ".join([str(self.scale), *states])
 
     def load(self, name: str) -> Mesh:
         """Return a mesh, read on first use; of a part, `OBJECT.PART`, its faces alone.

@@ -61,9 +61,8 @@ def read_symmetries(info: Path, name: str, scale: float, steps: int) -> np.ndarr
             raise ValueError("no mapping of names")
         digits = "".join(c for c in name if c.isdigit())
         keys = [name, digits.lstrip("0")] if name.startswith("obj_") else [name]
-        entry = next(
-            (table[k] for k in keys if k in table), table if "symmetries_discrete" in table else {}
-        )
+        alone = table if {"symmetries_discrete", "symmetries_continuous"} & set(table) else {}
+        entry = next((table[k] for k in keys if k in table), alone)
         discrete = [
             np.array(m, dtype=np.float64).reshape(4, 4)
             for m in entry.get("symmetries_discrete", [])

@@ -89,7 +89,8 @@ class BopReader(BaseReader):
 
         Args:
             root: The folder of a split, or of the dataset.
-            objects: `obj_000002` as the models are named, or YCB's names for YCB-V; None: all.
+            objects: `obj_000002` as the models are named, or YCB's names for YCB-V; None: all, by
+                YCB's names where `mesh_frame` is "original".
             meshes: For visibility.
             split: BOP's split, where `root` is the dataset's folder.
             mesh_frame: "bop" where meshes are the dataset's own (the default for obj_...; the mesh
@@ -117,7 +118,11 @@ class BopReader(BaseReader):
             )
         scenes = [(folder, self._read_scene(folder)) for folder in folders]
         wanted = [objects] if isinstance(objects, str) else objects
-        self._by_ycb_name = bool(wanted) and all(str(name) in ycb.CLASSES for name in wanted or [])
+        self._by_ycb_name = (
+            mesh_frame == "original"
+            if wanted is None
+            else bool(wanted) and all(str(name) in ycb.CLASSES for name in wanted)
+        )
         self._mesh_frame = mesh_frame or ("original" if self._by_ycb_name else "bop")
         if self._mesh_frame not in ("bop", "original"):
             raise UserError(f"data.options.mesh_frame={mesh_frame}: choose bop or original")

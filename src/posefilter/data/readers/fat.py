@@ -131,8 +131,7 @@ class FatReader(BaseReader):
         """
         entry = self._entries[i]
         record, camera = entry.record, entry.camera
-        color_path, depth_path, seg_path, json_path = self._files(record)
-        camera_path = json_path.with_name("_camera_settings.json")
+        color_path, depth_path, seg_path, json_path, camera_path, _ = self._files(record)
         check_camera(camera.K, camera_path)
         rgb = read_color(color_path)
         depth = read_depth(depth_path, DEPTH_UNITS)
@@ -207,10 +206,9 @@ class FatReader(BaseReader):
                 color = f"{stem}.jpg"
                 if color not in names and f"{stem}.png" in names:
                     color = f"{stem}.png"
-                files = tuple(
-                    folder / x
-                    for x in (color, f"{stem}.depth.png", f"{stem}.seg.png", f"{stem}.json")
-                )
+                own = (color, f"{stem}.depth.png", f"{stem}.seg.png", f"{stem}.json")
+                shared = ("_camera_settings.json", "_object_settings.json")
+                files = tuple(folder / x for x in (*own, *shared))
                 yield from self._list_frame(
                     2 * number + (camera == "right"), int(frame), files, classes, known[camera]
                 )

@@ -10,6 +10,7 @@ from posefilter.data.readers.fat import FatReader
 from posefilter.data.readers.part import PartReader
 from posefilter.data.readers.ycb_video import YCBVideoReader
 from posefilter.errors import UserError
+from posefilter.meshes import ycb
 from posefilter.meshes.parts import split_part
 from posefilter.meshes.store import MeshStore
 
@@ -78,6 +79,25 @@ def open_reader(
         raise UserError(
             f"data.options: {str(error).split('() ')[-1]} of the {source} reader"
         ) from error
+
+
+def open_whole(
+    source: str,
+    root: str | Path,
+    names: Sequence[str],
+    meshes: MeshStore,
+    on_error: str = "raise",
+    **options: Any,
+) -> BaseReader:
+    """Return the reader of all classes of a dataset, which are called as some of them are: a BOP
+    dataset of YCB's objects by YCB's names, where these are. A part is read by itself.
+
+    Raises UserError as `open_reader` does.
+    """
+    part = _asked_part(names, meshes)
+    if source == "bop" and all(name in ycb.CLASSES for name in names):
+        options["mesh_frame"] = options.get("mesh_frame") or "original"
+    return open_reader(source, root, part, meshes, on_error, **options)
 
 
 def _names(objects: str | Sequence[str] | None) -> list[str]:
