@@ -14,7 +14,7 @@ from posefilter.errors import UserError
 from posefilter.estimator import count_instances
 from posefilter.geometry.camera import back_project
 from posefilter.geometry.pose import make_pose
-from posefilter.instances.detect import Detection, detect
+from posefilter.instances.detect import Detection, _is_open, detect, resolve
 from posefilter.models.base import PoseEstimator
 from posefilter.types import Batch, BeliefBatch, ObjectModel, Trace
 
@@ -197,3 +197,38 @@ def test_counts_are_numbers_of_objects_that_are_loaded() -> None:
     for instances, told in wrong:
         with pytest.raises(UserError, match=told):
             count_instances(instances, ["a", "b"])
+
+
+def make_detection(first: int, last: int, probability: float) -> Detection:
+    """Return what is seen on some pixels of one row."""
+    mask = torch.zeros(1, 200, dtype=torch.bool)
+    mask[:, first:last] = True
+    said = torch.tensor([probability], dtype=torch.float64)
+    none = BeliefBatch(*(torch.zeros(1) for _ in BeliefBatch._fields))
+    return Detection(0, none, Assessment(said, said), mask, mask)
+
+
+def test_pixels_are_given_anew_in_each_round() -> None:
+    a, b, c = (
+        make_detection(0, 100, 0.6),
+        make_detection(0, 45, 0.9),
+        make_detection(45, 70, 0.8),
+    )
+    at_once = resolve([a, b, c])
+    assert [one.probability for one in at_once] == [0.9, 0.8]  # 30 of a's 100 pixels are its own
+    in_turn = resolve([*resolve([a, b]), c])
+    assert [one.probability for one in in_turn] == [0.9, 0.8]
+    kept = {one.probability: one for one in resolve([a, b])}
+    doubted = kept[0.9]._replace(assessment=make_detection(0, 45, 0.3).assessment)
+    (left,) = resolve([kept[0.6], doubted])
+    assert left.probability == 0.6
+    assert int(left.mask.sum()) == 100
+
+
+def test_an_answer_that_is_absent_after_all_takes_no_place() -> None:
+    found, absent = make_detection(0, 9, 0.99), make_detection(20, 29, 0.0)
+    job = cast(Any, SimpleNamespace(number=0, count=2, searches=2, exhausted=False))
+    assert _is_open(job, [found, absent], Costs())
+    assert not _is_open(job, [found, make_detection(20, 29, 0.99)], Costs())
+    job.searches = 3
+    assert not _is_open(job, [found, absent], Costs())

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from posefilter.confidence.calibration import read_calibration
-from posefilter.confidence.fit import Frames, cross_validate, fit_calibration
+from posefilter.confidence.fit import Frames, cross_validate, fit_calibration, make_frames
 from posefilter.confidence.tolerance import (
     RIGHT,
     PoseErrors,
@@ -183,3 +183,28 @@ def test_a_turn_about_a_continuous_symmetry_is_no_error() -> None:
     alone = measure_pose_errors(truth @ between, truth, make_model(group[:1].float()))
     assert math.degrees(float(alone.rotation)) == pytest.approx(5, abs=1e-3)
     assert float(errors.add) < 0.15 * float(alone.add)
+
+
+def test_an_estimate_that_is_not_finite_is_infinitely_far_off() -> None:
+    eye = torch.eye(4, dtype=torch.float64)
+    model = make_model(eye[None].float())
+    errors = measure_pose_errors(torch.stack([eye * math.nan, eye]), eye.expand(2, 4, 4), model)
+    for part in errors:
+        assert part[0] == math.inf
+        assert float(part[1]) == pytest.approx(0, abs=1e-6)
+    assert PoseTolerance(add=0.1).accepts(errors).tolist() == [False, True]
+
+
+def test_what_is_not_finite_is_calibrated_with_and_read_again() -> None:
+    """Of a filter whose arithmetic fails in some image."""
+    rng = np.random.default_rng(0)
+    values = [{name: torch.from_numpy(rng.normal(size=60)) for name in NAMES}]
+    values[0]["a"][3], values[0]["b"][7] = -math.inf, math.nan
+    there = np.arange(60) < 40
+    off = [np.where(there, rng.uniform(0, 0.2, 60), np.nan) for _ in range(4)]
+    for one in off:
+        one[5] = math.inf
+    frames = make_frames(values, [there], [PoseErrors(*off)])
+    assert not frames.correct[5]
+    made = fit_calibration(frames, "fat")
+    assert read_calibration(made.to_plain(), "x") == made

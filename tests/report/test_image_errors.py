@@ -20,6 +20,7 @@ from posefilter.report.comparison_page import (
     make_comparison_page,
     match_images,
     read_two_runs,
+    tabulate_common,
 )
 from posefilter.report.gather import read_run
 from posefilter.report.image_errors import (
@@ -144,6 +145,31 @@ def test_images_are_matched_by_name_not_by_index(pair: tuple[Path, Path]) -> Non
     verdict = judge(pairs)
     assert (verdict.a, verdict.b, verdict.equal) == (35, 0, 0)
     assert verdict.chance == pytest.approx(2 / 2**35)
+
+
+def test_instances_of_an_image_are_paired_in_their_order() -> None:
+    two = [make_row(0, 3.0), make_row(0, 50.0)]
+    assert [(pair.a.add_mm, pair.b.add_mm) for pair in match_images(two, two)] == [
+        (3.0, 3.0),
+        (50.0, 50.0),
+    ]
+    assert judge(match_images(two, two))[:3] == (0, 0, 2)
+    # one test left an instance out, and nothing tells which
+    assert match_images([*two, make_row(1, 2.0)], [two[1], make_row(1, 4.0)]) == [
+        (make_row(1, 2.0), make_row(1, 4.0))
+    ]
+
+
+def test_a_median_that_is_infinite_is_not_like_one_that_is_not() -> None:
+    half = [make_row(k, math.inf if k < 6 else 3.0) for k in range(10)]
+    found = [make_row(k, 3.0) for k in range(10)]
+    for rows, sign in (({"A": half, "B": found}, "-"), ({"A": found, "B": half}, "+")):
+        cells = {row[0]: row[3] for row in tabulate_common(rows).rows}
+        changed = cells["median ADD"]
+        assert isinstance(changed, Text)
+        assert changed == Text(f"{sign}inf mm", "good" if sign == "-" else "bad")
+    cells = {row[0]: row[3] for row in tabulate_common({"A": half, "B": half}).rows}
+    assert cells["median ADD"] == "alike"
 
 
 def test_a_comparison_turned_round_is_the_same(pair: tuple[Path, Path]) -> None:

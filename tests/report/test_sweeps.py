@@ -129,6 +129,16 @@ def test_summary_alone_is_enough(tmp_path: Path) -> None:
     assert "add-auc-filter-particles.png" in files
 
 
+def test_a_failed_job_of_a_summary_counts_for_no_setting(tmp_path: Path) -> None:
+    rows = "filter.particles,seed,add_auc,folder,error\n"
+    rows += "50,0,90,a,\n50,1,,b,out of memory\n1000,0,50,c,\n1000,1,50,d,\n"
+    (tmp_path / "summary.csv").write_text(rows)
+    found = read_sweep(tmp_path)
+    assert [job.folder for job in found.jobs] == ["a", "c", "d"]
+    assert [(job.folder, job.error) for job in found.failed] == [("b", "out of memory")]
+    assert find_best_job(found).folder == "a"
+
+
 def test_tables_are_read_as_they_are_written_whatever_the_locale(tmp_path: Path) -> None:
     """A file that is opened in the locale's encoding is a warning, and here an error."""
     write_errors(

@@ -54,6 +54,7 @@ def make_frames(
     names = tuple(values[0])
     rows = [np.stack([one[name].double().cpu().numpy() for name in names], 1) for one in values]
     all_rows, seen = (np.concatenate(one) for one in (rows, present))
+    all_rows[~np.isfinite(all_rows)] = np.nan  # no number
     off = PoseErrors(*(np.concatenate(parts) for parts in zip(*errors, strict=True)))
     return Frames(names, all_rows, seen, RIGHT.accepts(off), None, off)
 

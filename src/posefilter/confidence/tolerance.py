@@ -99,21 +99,24 @@ def measure_pose_errors(poses: Tensor, truth: Tensor, object_model: ObjectModel)
     """Return how far estimates are off, up to symmetries; a continuous one has no gaps.
 
     Args:
-        poses: (B, 4, 4) camera_from_object [m].
+        poses: (B, 4, 4) camera_from_object [m]; one that is not finite is infinitely far off.
         truth: (B, 4, 4).
         object_model: The object.
     """
     from posefilter.metrics.errors import add, add_s  # trees of scipy, prediction needs none
 
     truth, points = truth.to(poses), object_model.points.to(poses)
+    known = poses.isfinite().flatten(1).all(1)
+    poses = torch.where(known[:, None, None], poses, truth)
     equal = truth[:, None] @ densify(object_model.symmetries.double()).to(truth)
     distances = add(poses[:, None], equal, points)
     least, which = distances.min(1)
     near = equal[torch.arange(len(equal)), which]
     center = object_model.center.to(poses)
-    return PoseErrors(
+    errors = (
         (origin_of(poses, center) - origin_of(near, center)).norm(dim=-1),
         angle_between(rotation_of(poses), rotation_of(near)),
         least / object_model.diameter,
         add_s(poses, truth, points) / object_model.diameter,
     )
+    return PoseErrors(*(one.masked_fill(~known, torch.inf) for one in errors))

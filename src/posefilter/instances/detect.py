@@ -34,7 +34,8 @@ class Detection(NamedTuple):
     number: int  # of its method
     belief: BeliefBatch  # of one image
     assessment: Assessment | None  # None where the method is not calibrated
-    mask: Tensor  # (H, W) bool, the pixels that are its own, of the first method's image
+    visible: Tensor  # (H, W) bool, its visible pixels, of the first method's image
+    mask: Tensor  # (H, W) bool, those that are its own: a more probable answer keeps the others
 
     @property
     def probability(self) -> float:
@@ -102,7 +103,7 @@ def resolve(found: Sequence[Detection]) -> list[Detection]:
     Those without a probability come last, by their scores.
     """
     order = sorted(found, key=lambda one: (-one.probability, -float(one.belief.score[0])))
-    kept = keep_pixels([one.mask for one in order], _SHARE)
+    kept = keep_pixels([one.visible for one in order], _SHARE)
     pairs = zip(order, kept, strict=True)
     return [one._replace(mask=mask) for one, mask in pairs if mask is not None]
 
@@ -119,7 +120,7 @@ def _is_open(job: _Job, found: Sequence[Detection], costs: Costs) -> bool:
     if job.exhausted or job.searches >= job.count + _SPARE:
         return False
     own = [_judge(one, costs) for one in found if one.number == job.number]
-    return sum(verdict != "unsure" for verdict in own) < job.count
+    return sum(verdict in ("found", None) for verdict in own) < job.count
 
 
 def _search(
@@ -138,7 +139,8 @@ def _search(
         assessment = _assess(job.method, trace.belief, image, encoding)
         # with the pixels of others, so that an answer beside what is found, of the same object, is
         # seen to have too few of its own
-        one = Detection(job.number, trace.belief, assessment, resize_mask(visible, grid))
+        whole = resize_mask(visible, grid)
+        one = Detection(job.number, trace.belief, assessment, whole, whole)
         one = one if bool((visible & ~hidden).any()) and is_there(one, costs) else None
     job.exhausted = one is None
     job.seconds += time.perf_counter() - start

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from itertools import product
 from pathlib import Path
 from statistics import median
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from posefilter.errors import UserError
 from posefilter.figures.layout import format_length
@@ -80,13 +80,26 @@ def read_two_runs(text: str) -> tuple[Run, Run]:
 
 
 def match_images(a: Sequence[ImageError], b: Sequence[ImageError]) -> list[Pair]:
-    """Return the images that two tests share, by dataset name and ids, in the first one's order."""
+    """Return the images that two tests share, by dataset name and ids, in the first one's order.
 
-    def identify(row: ImageError) -> tuple[str, int, int, int, str]:
-        return row.image, row.scene_id, row.im_id, row.obj_id, row.object
+    Of several instances in an image the first are a pair, the second, and so on: a dataset always
+    lists them in the same order. Where the tests have not as many of them, none is a pair.
+    """
+    own, others = (_group_by_identity(rows) for rows in (a, b))
+    return [
+        Pair(*both)
+        for key, rows in own.items()
+        if len(rows) == len(others.get(key, ()))
+        for both in zip(rows, others[key], strict=True)
+    ]
 
-    others = {identify(row): row for row in b}
-    return [Pair(row, others[identify(row)]) for row in a if identify(row) in others]
+
+def _group_by_identity(rows: Sequence[ImageError]) -> dict[tuple[Any, ...], list[ImageError]]:
+    out: dict[tuple[Any, ...], list[ImageError]] = {}
+    for row in rows:
+        key = (row.image, row.scene_id, row.im_id, row.obj_id, row.object)
+        out.setdefault(key, []).append(row)
+    return out
 
 
 def judge(pairs: Sequence[Pair]) -> Verdict:
@@ -190,7 +203,7 @@ def tabulate_common(rows: dict[str, list[ImageError]]) -> Table:
     for kind, name in product(("add", "add_s"), found[0]["add"]):
         info = find_metric(f"{kind}/{name}")
         first, second = (one[kind][name] for one in found)
-        change = second - first if math.isfinite(first) and math.isfinite(second) else 0.0
+        change = 0.0 if first == second else second - first  # both may be infinite
         difference: Cell = "alike"
         if f"{abs(change):.1f}" != "0.0":
             style: Style = "good" if change * info.direction > 0 else "bad"

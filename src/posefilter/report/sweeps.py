@@ -136,7 +136,7 @@ def read_jobs_from_csv(path: Path) -> tuple[list[str], list[Job]]:
         figures = {name: parse_number(row.get(column) or "") for column, name in COLUMNS.items()}
         numbers = {name: float(x) for name, x in figures.items() if not isinstance(x, str)}
         place = {axis: parse_number(row[axis]) for axis in axes}
-        jobs.append(Job(place, numbers, row.get("folder") or ""))
+        jobs.append(Job(place, numbers, row.get("folder") or "", row.get("error") or ""))
     return axes, jobs
 
 
