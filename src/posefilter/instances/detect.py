@@ -23,7 +23,8 @@ from posefilter.types import Batch, BeliefBatch, Trace
 _LIKELY = 0.5  # probability from which an answer is taken out of the image for other classes
 # particles of the filter that follows one instance at most, and of its first step
 _PARTICLES, _INITIAL_PARTICLES = 80, 320
-_SPARE = 1  # searches beyond the instances asked for, while an answer is doubtful
+# searches beyond the instances asked for, while an answer is doubtful, or was taken back
+_SPARE = 1
 _SHARE = 0.5  # of its visible pixels, that an answer must have for itself
 _WORTH = 0.3  # mean probability of the network's surest cells, below which there is no more to find
 
