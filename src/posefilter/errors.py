@@ -2,6 +2,8 @@
 for a user's wish to stop.
 """
 
+import math
+from collections.abc import Sequence
 from pathlib import Path
 from signal import Signals
 
@@ -27,6 +29,17 @@ def check_choice(key: str, value: object, *choices: str) -> None:
     """Raise UserError, naming the key, unless a setting is one of its choices."""
     if value not in choices:
         raise UserError(f"{key}={value!r} is unknown: choose {' or '.join(choices)}")
+
+
+def check_range(key: str, value: Sequence[float], least: float = -math.inf) -> tuple[float, float]:
+    """Return the two ends of a range as numbers.
+
+    Raises UserError, naming the key, unless these are two, the lower first and above `least`.
+    """
+    if len(value) != 2 or not least < value[0] <= value[1] < math.inf:
+        above = "" if least == -math.inf else f" above {least:g}"
+        raise UserError(f"{key}={list(value)}: must be two numbers{above}, the lower first")
+    return float(value[0]), float(value[1])
 
 
 def missing_package(what: str, package: str, extra: str) -> UserError:

@@ -62,6 +62,23 @@ def test_settings_and_metrics_are_read_back(tmp_path: Path) -> None:
     assert set(board.Tags()["scalars"]) - {"hp_metric"} == {"val/best_score"}
 
 
+def test_a_resumed_run_goes_on_with_its_best_score(tmp_path: Path) -> None:
+    before, after = TensorBoardLayout(), TensorBoardLayout()
+    after.load_state_dict(before.state_dict())  # before any validation
+    logged: list[dict[str, float]] = []
+    trainer: Any = SimpleNamespace(
+        loggers=[SimpleNamespace(log_metrics=lambda metrics, step: logged.append(metrics))],
+        global_step=10,
+        is_global_zero=True,
+        sanity_checking=False,
+    )
+    for layout, score in ((before, 80.0), (after, 70.0)):
+        after.load_state_dict(before.state_dict())
+        trainer.callback_metrics = {"val/score": torch.tensor(score)}
+        layout.on_validation_end(trainer, torch.nn.Module())  # type: ignore[arg-type]
+    assert [one["val/best_score"] for one in logged] == [80.0, 80.0]
+
+
 def read_experiment(folder: Path) -> tuple[list[str], Any, list[str]]:
     """Return TensorBoard's runs below a folder, the table of the tab HParams, and the names of its
     lines.

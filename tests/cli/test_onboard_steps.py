@@ -2,6 +2,7 @@
 left is the time of the stages that are not done.
 """
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -47,6 +48,19 @@ def test_what_is_left_is_the_time_of_the_stages_that_are_not_done(tmp_path: Path
     assert work.rest(speed) == 0
     cfg.test_frames = 30  # the test is to be made again
     assert work.rest(speed) == 30 + 25
+
+
+def test_another_texture_mapping_is_another_mesh(tmp_path: Path) -> None:
+    cfg = OmegaConf.create({"frames": 400})
+    mesh = build("carton")
+    assert mesh.corner_uv is not None
+    flipped = replace(mesh, corner_uv=mesh.corner_uv * [1, -1] + [0, 1])
+    works = [
+        Onboarding(cfg, one, tmp_path, Stages(tmp_path / "record.json"))
+        for one in (mesh, replace(mesh), flipped)
+    ]
+    same, again, other = (work.mesh_digest for work in works)
+    assert same == again != other
 
 
 @pytest.mark.parametrize(

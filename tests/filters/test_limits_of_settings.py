@@ -8,11 +8,13 @@ from posefilter.errors import UserError
 from posefilter.filters.agreement import Agreement
 from posefilter.filters.candidates import PersistentParticles
 from posefilter.filters.importance import ImportanceSampling
+from posefilter.filters.initialize import FromDepth
 from posefilter.filters.loop import ParticleFilter
 from posefilter.filters.refine import MeanShift
 from posefilter.filters.resample import Islands, Soft, Systematic
 from posefilter.filters.resample_move import ResampleMove
 from posefilter.filters.schedule import Geometric
+from posefilter.models.candidate_samplers import CandidatePoses
 
 
 def make_filter(**settings: Any) -> ParticleFilter:
@@ -38,6 +40,10 @@ def make_islands(size: int) -> Islands:
         (Agreement, {"top_fragments": 1}, {"top_fragments": 0}),
         (Agreement, {"scale_m": 1e-6}, {"scale_m": 0.0}),
         (PersistentParticles, {"particles": 1}, {"particles": 0}),
+        (FromDepth, {"depth_offset": (-0.1, -0.1)}, {"depth_offset": (0.9, 0.1)}),
+        (FromDepth, {"depth_offset": (0, 1)}, {"depth_offset": (0.1,)}),
+        (CandidatePoses, {"sigma_range": (0.1, 0.1)}, {"sigma_range": (0.25, 0.004)}),
+        (CandidatePoses, {"sigma_range": (0.1, 0.2)}, {"sigma_range": (0.0, 0.25)}),
         (PersistentParticles, {"levels": 2}, {"levels": 1}),
         (ImportanceSampling, {"samples": 1}, {"samples": 0}),
         (ImportanceSampling, {"rounds": 1}, {"rounds": 0}),

@@ -80,3 +80,8 @@ def test_latent_net_remembers() -> None:
     second = net(seen, extra, first.latent)
     assert first.pose.shape == (1, 3, 9)
     assert (first.displacement - second.displacement).abs().min() > 1e-6
+
+
+def test_an_unknown_normalization_is_refused() -> None:
+    with pytest.raises(UserError, match=r"model\.net\.normalization='bacth' is unknown"):
+        PatchNet(0, 5, normalization="bacth")

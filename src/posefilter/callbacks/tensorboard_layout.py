@@ -2,7 +2,9 @@
 which runs are compared.
 """
 
+import math
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 from lightning import Callback, LightningModule, Trainer
 from tensorboard.compat.proto.summary_pb2 import Summary
@@ -108,6 +110,15 @@ class TensorBoardLayout(Callback):
         self.settings: dict[str, Setting] = {}
         self.swept: tuple[str, ...] = ()
         self._best = float("-inf")
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return what a resumed run goes on with."""
+        return {"best": self._best if math.isfinite(self._best) else None}
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Go on with the best score of the run that is resumed."""
+        best = state_dict["best"]
+        self._best = float("-inf") if best is None else float(best)
 
     def on_fit_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Write layout and settings."""

@@ -106,7 +106,8 @@ class Onboarding:
     @cached_property
     def mesh_digest(self) -> str:
         """What decides how the mesh looks, in short."""
-        parts = (self.mesh.vertices, self.mesh.faces, self.mesh.texture, self.mesh.corner_colors)
+        mesh = self.mesh
+        parts = (mesh.vertices, mesh.faces, mesh.texture, mesh.corner_colors, mesh.corner_uv)
         content = b"".join(np.asarray(part).tobytes() for part in parts if part is not None)
         return sha256(content).hexdigest()[:16]
 

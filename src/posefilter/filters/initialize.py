@@ -6,6 +6,7 @@ import torch
 from torch import Generator, Tensor, nn
 
 from posefilter.capabilities import Capabilities
+from posefilter.errors import check_range
 from posefilter.geometry.camera import rays
 from posefilter.geometry.pose import pose_about
 from posefilter.geometry.rotation import random_rotation
@@ -87,7 +88,7 @@ class FromDepth:
     requires: ClassVar[Capabilities] = ("pose_space",)
 
     def __init__(self, depth_offset: tuple[float, float] = (0.1, 0.9)) -> None:
-        self.depth_offset = (float(depth_offset[0]), float(depth_offset[1]))
+        self.depth_offset = check_range("filter.initialize.depth_offset", depth_offset)
 
     def __call__(
         self, batch: Batch, encoding: Encoding, method: Method, particles: int, generator: Generator

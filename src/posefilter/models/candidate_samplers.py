@@ -7,6 +7,7 @@ import torch
 from torch import Generator, Tensor
 
 from posefilter.capabilities import Capabilities
+from posefilter.errors import check_range
 from posefilter.filters.candidates import (
     PersistentParticles,
     sample_around_truth,
@@ -101,7 +102,7 @@ class CandidatePoses(CandidateSampler):
         rotations: Propagate | None = None,
     ) -> None:
         self.candidates_per_kind, self.proposals = candidates_per_kind, proposals
-        self.sigma_range = (float(sigma_range[0]), float(sigma_range[1]))
+        self.sigma_range = check_range("model.candidate_sampler.sigma_range", sigma_range, 0.0)
         self.persistent_sigma_probability = persistent_sigma_probability
         self.initial_sigma = float(initial_sigma)
         self.rotations = rotations or HalfTurnRotations(1.0)

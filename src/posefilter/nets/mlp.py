@@ -145,6 +145,7 @@ class PatchNet(nn.Module):
         super().__init__()
         if kernel < 1 or kernel % 2 == 0:
             raise UserError(f"model.net.kernel={kernel}: must be odd, such as 3, 5 or 9")
+        check_choice("model.net.normalization", normalization, "batch", "layer")
         if pose_width:
             raise UserError(
                 "model/net=patch predicts no pose: choose model/pose_head=none, or model/net=latent"
