@@ -18,6 +18,12 @@ _PARTS = (".*.part", ".*.part.mp4")  # a video's ending tells its encoder the fo
 _SYNC_EVERY = 1.0  # of a file that grows [s]
 
 
+def stamp_files(paths: Sequence[Path]) -> str:
+    """Return what changes when one of some files does; those that are missing are left out."""
+    states = [path.stat() for path in paths if path.exists()]
+    return " ".join(f"{state.st_size}:{state.st_mtime_ns}" for state in states)
+
+
 @contextmanager
 def open_whole(path: Path, sync: bool = True) -> Iterator[BinaryIO]:
     """Open a file for writing that takes its name only when all of it is on the disk.

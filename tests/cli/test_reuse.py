@@ -43,7 +43,7 @@ def test_training_is_shared_where_no_setting_of_it_differs(
 def test_what_another_job_has_learned_comes_without_its_calibration(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """It is of the other's filter, and only the recipe tells that."""
+    """It is of the other's filter, which the recipe alone says."""
     for name in ("0_a", "1_b"):
         (tmp_path / name / "checkpoints").mkdir(parents=True)
     other = {"state_dict": {}, "recipe": {"settings": {}}, "calibration": {"features": []}}
@@ -53,7 +53,7 @@ def test_what_another_job_has_learned_comes_without_its_calibration(
     monkeypatch.setattr(reuse, "learned_from", lambda job: "this")
     monkeypatch.setattr(reuse, "recipe", lambda job: {"settings": {"filter": {"particles": 9}}})
     monkeypatch.setattr(reuse, "differing", lambda a, b: ["filter.particles"])
-    monkeypatch.setattr(reuse, "read_checkpoint", lambda file: other)
+    monkeypatch.setattr(reuse, "read_checkpoint", lambda file: dict(other))
     job = SimpleNamespace(swept=True, folder=tmp_path / "1_b", cfg=SimpleNamespace(console="json"))
     assert take_over(job) == {"learned_from": "this", "trained_as": "0_a"}  # type: ignore[arg-type]
     kept = torch.load(tmp_path / "1_b" / "checkpoints" / "best.ckpt", weights_only=True)
@@ -61,3 +61,6 @@ def test_what_another_job_has_learned_comes_without_its_calibration(
         "state_dict": {},
         "recipe": {"settings": {"filter": {"particles": 9}}},
     }
+    monkeypatch.setattr(reuse, "recipe", lambda job: {"settings": {}})  # of the same filter
+    assert take_over(job) is not None  # type: ignore[arg-type]
+    assert torch.load(tmp_path / "1_b" / "checkpoints" / "best.ckpt", weights_only=True) == other

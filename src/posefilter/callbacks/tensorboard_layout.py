@@ -2,7 +2,6 @@
 which runs are compared.
 """
 
-import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -113,12 +112,11 @@ class TensorBoardLayout(Callback):
 
     def state_dict(self) -> dict[str, Any]:
         """Return what a resumed run goes on with."""
-        return {"best": self._best if math.isfinite(self._best) else None}
+        return {"best": self._best}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Go on with the best score of the run that is resumed."""
-        best = state_dict["best"]
-        self._best = float("-inf") if best is None else float(best)
+        self._best = float(state_dict["best"])
 
     def on_fit_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Write layout and settings."""

@@ -262,8 +262,7 @@ def fit_beliefs(
         own, truth = beliefs.select(held)
         scale = None if whole is None else fit(np.flatnonzero(fold != k)) or whole
         if scale is not None:
-            told = probability[held], features[held]
-            own, _ = calibrate_belief(own, *told, scale, object_model)
+            own, _ = calibrate_belief(own, probability[held], features[held], scale, object_model)
         nonconformity[held] = score_truth(own, truth, object_model).nonconformity.numpy()
     return whole, nonconformity
 

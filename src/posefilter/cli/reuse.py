@@ -7,7 +7,7 @@ from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
-from posefilter.cli.checkpoints import read_checkpoint, recipe
+from posefilter.cli.checkpoints import is_calibrated_filter, read_checkpoint, recipe
 from posefilter.cli.comparing import differing
 from posefilter.cli.console import say
 from posefilter.cli.files import save_whole
@@ -85,10 +85,10 @@ def take_over(job: Job) -> dict[str, Any] | None:
             continue
         now = recipe(job)
         checkpoint = read_checkpoint(best)
-        # a calibration belongs to the filter that it was made with
-        own = {key: value for key, value in checkpoint.items() if key != "calibration"}
-        save_whole({**own, "recipe": now}, job.folder / "checkpoints" / "best.ckpt")
         others = ", ".join(differing(checkpoint["recipe"], now))
+        if not is_calibrated_filter(now["settings"], checkpoint["recipe"]["settings"]):
+            checkpoint.pop("calibration", None)
+        save_whole({**checkpoint, "recipe": now}, job.folder / "checkpoints" / "best.ckpt")
         sentence = (
             f"{job.folder.name}: only tested, with what {folder.name} has learned; "
             f"training does not depend on {others}"

@@ -35,7 +35,7 @@ _LOGIT = 5.0  # beyond, on either side, frames are too few to tell more
 # mean and standard deviation of the prior, near the mean and the spread of ten objects' own fits
 _BIAS, _SLOPE = (-0.2, 0.5), (-0.2, 0.1)
 _WEIGHT = 0.1  # standard deviation of the prior of a weight, times that of its feature
-_LEAST_SPREAD = 0.05  # of a feature: one that is nearly constant tells nothing
+_LEAST_SPREAD = 0.05  # of a feature: one that is nearly constant says nothing of the width
 _MOST = 2.0  # of the log of the factor: features beyond those that were seen say no more
 # before any particle an error of so many diameters, a turn as the shift at the radius, counts as
 # much as so many particles: C has full rank also where few are near the estimate
@@ -112,13 +112,13 @@ def fit_belief_scale(
 
     if len(probability) < FEWEST_RIGHT:
         return None
-    told = torch.cat([_limit_logit(probability)[:, None], features.double()], dim=1).numpy()
-    x = np.concatenate([np.ones((len(told), 1)), told], axis=1)
+    logit = _limit_logit(probability)
+    x = torch.column_stack([torch.ones_like(logit), logit, features.double()]).numpy()
     within = torch.linalg.solve(spread.scatter, spread.twist[..., None])[..., 0]
     distance = (within * spread.twist).sum(-1).numpy()  # squared, of Mahalanobis
     mean = np.array([_BIAS[0], _SLOPE[0], *[0.0] * features.shape[1]])
-    varied = x[:, 2:].std(axis=0).clip(_LEAST_SPREAD)
-    deviation = np.concatenate([[_BIAS[1], _SLOPE[1]], _WEIGHT / varied])
+    own_spread = x[:, 2:].std(axis=0).clip(_LEAST_SPREAD)
+    deviation = np.array([_BIAS[1], _SLOPE[1], *(_WEIGHT / own_spread)])
 
     def negative_log_posterior(w: np.ndarray) -> tuple[float, np.ndarray]:
         """Return it up to a constant, and its gradient."""

@@ -140,7 +140,7 @@ def _fit(
     out = Calibration(frames.features, center, scale, none, none, counts, source, dict(quality))
     if first is not None:
         out = replace(out, choice=first.choice)
-    x = standardize_frames(frames, first)
+    x = standardize(frames.values, center, scale)
     share = there.mean()
     balance = np.where(there, 0.5 / share, 0.5 / (1 - share))
     errors = None

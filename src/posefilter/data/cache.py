@@ -16,7 +16,7 @@ import numpy as np
 
 from posefilter.data.frames import FrameRecord, Sample
 from posefilter.errors import UserError
-from posefilter.files import open_whole, remove_parts, write_whole
+from posefilter.files import open_whole, remove_parts, stamp_files, write_whole
 from posefilter.paths import check_inside
 
 CACHES = ("memory", "disk", "none")
@@ -241,5 +241,4 @@ def _read_prepared(path: Path) -> Prepared:
 
 def _stamp(record: FrameRecord, files: int | None = None) -> str:
     """Return what changes when a source file does: any of them, or the first two (color, depth)."""
-    states = [path.stat() for path in record.files[:files] if path.exists()]
-    return " ".join(f"{state.st_size}:{state.st_mtime_ns}" for state in states)
+    return stamp_files(record.files[:files])

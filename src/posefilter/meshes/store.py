@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from posefilter.errors import UserError
+from posefilter.files import stamp_files
 from posefilter.meshes import ycb
 from posefilter.meshes.builtin import catalog as builtin
 from posefilter.meshes.files import SUFFIXES, read_mesh
@@ -86,9 +87,7 @@ class MeshStore:
         own = [name for name in dict.fromkeys(whole) if name in self._files]
         meshes = [self._files[name] for name in own]
         beside = [folder / FILE for name in own for folder in self._folders_of(name)]
-        found = [path.stat() for path in (*meshes, *beside) if path.is_file()]
-        states = [f"{state.st_size}:{state.st_mtime_ns}" for state in found]
-        return " ".join([str(self.scale), *states])
+        return f"{self.scale} {stamp_files([*meshes, *beside])}"
 
     def load(self, name: str) -> Mesh:
         """Return a mesh, read on first use; of a part, `OBJECT.PART`, its faces alone.
