@@ -19,7 +19,7 @@ import argparse
 import csv
 import json
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -51,12 +51,17 @@ HEAD += tuple(f"{k}: {what}" for k in KINDS.values() for what in ("images", "ADD
 
 
 def read_frames(
-    root: str, meshes: str, name: str, images: int, part: str = "test"
+    root: str,
+    meshes: str,
+    name: str,
+    images: int,
+    part: str = "test",
+    split: Mapping[str, float] = SPLIT,
 ) -> list[tuple[str, Sample]]:
     """Return the scene and the sample of evenly chosen frames of a part that show the object."""
     reader = open_reader("fat", root, None, open_meshes(meshes, None, "fat", [name]))
     records: Sequence[FrameRecord] = reader.records()
-    chosen = split_records(records, SPLIT, 0, Path(root))[part]
+    chosen = split_records(records, split, 0, Path(root))[part]
     own = [i for i in chosen if records[i].object == name]
     out = []
     for i in np.random.default_rng(0).permutation(own):  # the objects' folders follow each other

@@ -13,6 +13,7 @@ from omegaconf import OmegaConf
 from posefilter.confidence.blank import find_blank
 from posefilter.confidence.tolerance import PoseTolerance
 from posefilter.confidence.verdicts import Costs
+from posefilter.devices import choose_device
 from posefilter.errors import UserError, find_reason
 from posefilter.images import Images, check_images, make_batch
 from posefilter.instances.detect import detect
@@ -53,7 +54,7 @@ class Estimator:
         for method in methods:
             if "pose" not in method.capabilities:
                 raise UserError(f"{type(method).__name__} detects, and estimates no pose")
-        device = device or ("cuda" if torch.cuda.is_available() else "cpu")
+        device = device or choose_device()
         try:
             self.methods = tuple(method.to(device).eval() for method in methods)
         except (RuntimeError, AssertionError) as error:  # torch's, of devices that are not there

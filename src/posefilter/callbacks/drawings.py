@@ -182,7 +182,7 @@ def glimpses(o: Occasion) -> Drawn:
     """Draw what a few particles saw at each step (the paper, figure 2)."""
     assert isinstance(o.method, HasImagePatches)
     states = follow_particles(o.trace)
-    patches = extract_glimpses(o.method, o.encoding, states)
+    patches = extract_glimpses(o.method, o.encoding, states.to(o.method.device))
     return draw_glimpses(o.one.rgb, o.mask(), states.numpy(), patches, o.title("Glimpses"))
 
 

@@ -43,6 +43,7 @@ from posefilter.confidence.verdicts import Costs, score_verdicts
 from posefilter.data.absent import hide_annotation
 from posefilter.data.dataset import FrameDataset
 from posefilter.data.loaders import make_loader
+from posefilter.devices import choose_device
 from posefilter.errors import UserError
 from posefilter.filters.traces import keep_last_step
 from posefilter.locks import hold
@@ -79,7 +80,7 @@ def calibrate(job: Job) -> None:
             f"checkpoint={cfg.checkpoint}: {type(method).__name__} detects {name}, and estimates "
             "no pose that could be right"
         )
-    method.to("cuda" if torch.cuda.is_available() else "cpu").seed = cfg.seed
+    method.to(choose_device()).seed = cfg.seed
     settings = data_settings(job, checkpoint["recipe"]["settings"], name, "val")
     settings.limit_val = cfg.frames
     data = build_data(settings, cfg.console)

@@ -20,7 +20,7 @@ class Speed(NamedTuple):
     """Of a training on this machine."""
 
     step: float  # the fastest of some, as what else runs here may end [s]
-    image: float  # of the filter, the median of some [s]
+    image: float  # of the filter, likewise [s]
 
 
 def measure_speed(job: Job) -> Speed:
@@ -47,7 +47,7 @@ def measure_speed(job: Job) -> Speed:
     finally:
         shutil.rmtree(job.folder, ignore_errors=True)
     steps = np.diff(times)[_SKIPPED - 1 :]
-    return Speed(float(steps.min()), float(np.median(images)))
+    return Speed(float(steps.min()), min(images))
 
 
 def _time(work: Callable[[], None]) -> float:

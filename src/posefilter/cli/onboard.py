@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-import torch
 from omegaconf import DictConfig, OmegaConf
 
 from posefilter.callbacks.time_budget import TimeBudget
@@ -34,6 +33,7 @@ from posefilter.cli.reuse import step_of
 from posefilter.cli.stages import Stages
 from posefilter.cli.train import build, finish, fit, test
 from posefilter.confidence.fit import FEWEST
+from posefilter.devices import choose_device
 from posefilter.errors import UserError
 from posefilter.files import write_whole
 from posefilter.forms import NUMBER, TEXT
@@ -325,7 +325,7 @@ def calibrate(work: Onboarding) -> None:
     without = build_data(settings, work.cfg.console).absent_dataset("val", count)
     checkpoint = read_checkpoint(work.weights)
     method = method_of(checkpoint, lightning=False)
-    method.to("cuda" if torch.cuda.is_available() else "cpu")
+    method.to(choose_device())
     shown = work.cfg.console != JSON
     calibration = learn(method, [data.val_dataset], [without], data.source, shown)
     save_whole({**checkpoint, "calibration": calibration.to_plain()}, work.weights)

@@ -236,7 +236,7 @@ class TextureRotations:
         turns, first_tried = list_rotations(object_model)
         if len(turns) == 1:
             return belief
-        turns = turns.to(first)
+        turns, first_tried = turns.to(first), first_tried.to(first.device)
         log_posterior, tried = self._score(
             first, turns, first_tried, encoding, method, object_model, generator
         )

@@ -4,7 +4,8 @@
 rounding. Here the same numbers are computed in another order. What depends on the image alone is
 tabulated once. The inputs of all points lie feature by feature in one buffer, each written by
 operations on whole rows. The noise level is folded into the first layer's weights, and ReLUs into
-matrix products. The network goes over points in parts that fit into a processor's cache.
+matrix products. The network goes over points in parts: on a CPU those that fit into its cache, on a
+GPU as many as bound its memory.
 """
 
 import math
@@ -25,7 +26,8 @@ from posefilter.nets.linear import has_onednn
 if TYPE_CHECKING:
     from posefilter.nets.likelihood import Pixels, PoseLikelihood
 
-PART = 4096  # points that the network takes at once
+# points that the network takes at once
+PART, GPU_PART = 4096, 1 << 18
 _LEAST = 1e-12  # added to the shares of fragments, so that their sum can be divided by
 
 
@@ -37,11 +39,11 @@ class Tables(NamedTuple):
 
 
 def applies(device: torch.device) -> bool:
-    """Return whether poses can be scored here: without gradient, on a CPU, not traced for export.
-    A GPU has no use for operations on so small parts.
+    """Return whether poses can be scored here: without gradient, on a CPU or by CUDA, not traced
+    for export.
     """
     plain = not torch.is_grad_enabled() and not torch.compiler.is_compiling()
-    return plain and device.type == "cpu"
+    return plain and device.type in ("cpu", "cuda")
 
 
 def missing_context() -> UserError:
@@ -292,8 +294,9 @@ class _Weights:
     def score(self, inputs: Tensor, table: Tensor | None, cells: Tensor | None) -> Tensor:
         """Score points.  (F, points), (rows, 2 + C), (points,) -> (points,)."""
         out = inputs.new_empty(inputs.shape[1])
-        for start in range(0, len(out), PART):
-            part = slice(start, start + PART)
+        size = PART if inputs.device.type == "cpu" else GPU_PART
+        for start in range(0, len(out), size):
+            part = slice(start, start + size)
             x = torch.mm(inputs[:, part].to(self.dtype).t(), self.enter.t())
             if table is not None and cells is not None:
                 rows = table.index_select(0, cells[part]).to(self.dtype)
@@ -308,11 +311,13 @@ class _Weights:
 
 
 def _linear_relu(x: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
-    """relu(x W^T + b), in one operation where oneDNN has it.  (m, k), (n, k), (n,) -> (m, n)."""
-    if _FUSES:
+    """relu(x W^T + b), in one operation where oneDNN or cuBLAS has it.  (m, k), (n, k), (n,) -> (m,
+    n).
+    """
+    if _FUSES and x.device.type == "cpu":
         out: Tensor = torch.ops.mkldnn._linear_pointwise(x, weight, bias, "relu", [], "")
         return out
-    return torch.addmm(bias, x, weight.t()).relu_()
+    return torch._addmm_activation(bias, x, weight.t())
 
 
 _FUSES = has_onednn()

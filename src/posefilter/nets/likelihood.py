@@ -246,9 +246,10 @@ class PoseLikelihood(nn.Module):
         else:
             noise = torch.randn(len(poses), 1, pixels, 2, generator=generator, device=poses.device)
         if applies(poses.device) and sigma.numel() == 1:
-            half = torch.is_autocast_enabled("cpu")
-            dtype = torch.get_autocast_dtype("cpu") if half else poses.dtype
-            with torch.autocast("cpu", enabled=False):
+            kind = poses.device.type
+            half = torch.is_autocast_enabled(kind)
+            dtype = torch.get_autocast_dtype(kind) if half else poses.dtype
+            with torch.autocast(kind, enabled=False):
                 found = score(self, image, poses, sigma, center, radius, noise, dtype)
                 return found + self.judge_surface(image, poses, sigma, center, radius)
         # half precision would round poses to half a millimeter
