@@ -4,10 +4,12 @@ left is the time of the stages that are not done.
 
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from omegaconf import OmegaConf
 
+from posefilter.cli import onboard as command
 from posefilter.cli import run_command
 from posefilter.cli.measure_speed import Speed
 from posefilter.cli.onboard import STAGES, Onboarding, choose_steps
@@ -48,6 +50,30 @@ def test_what_is_left_is_the_time_of_the_stages_that_are_not_done(tmp_path: Path
     assert work.rest(speed) == 0
     cfg.test_frames = 30  # the test is to be made again
     assert work.rest(speed) == 30 + 25
+
+
+def test_the_time_of_measuring_is_not_given_to_the_training(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    settings = {"frames": 400, "test_frames": 60, "steps": None, "budget_minutes": 30}
+    cfg = OmegaConf.create({**settings, "console": "json"})
+    work = Onboarding(cfg, build(names()[0]), tmp_path, Stages(tmp_path / "record.json"))
+    speed, now, run = Speed(step=0.3, image=1.0), [0.0], SimpleNamespace(callbacks=[])
+
+    def measure(job: object) -> Speed:
+        now[0] += 70
+        return speed
+
+    monkeypatch.setattr("time.perf_counter", lambda: now[0])
+    monkeypatch.setattr(command, "measure_speed", measure)
+    monkeypatch.setattr(command, "fit", lambda run: {})
+    monkeypatch.setattr(Onboarding, "job", lambda *_: None)
+    monkeypatch.setattr(Onboarding, "run", SimpleNamespace(trainer=run))
+    monkeypatch.setattr(Onboarding, "is_done", lambda *_: True)
+    command.train(work)
+    values = work.stages.values
+    assert values["steps"] * values["seconds_per_step"] == pytest.approx(30 * 60 - 70)
+    assert len(run.callbacks) == 1  # which keeps to it
 
 
 def test_another_texture_mapping_is_another_mesh(tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 on.
 """
 
+import time
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -270,10 +271,11 @@ def train(work: Onboarding) -> None:
     """Train for as many steps as fit, from where it was interrupted if it was."""
     values, console = work.stages.values, work.cfg.console
     if not work.is_measured:
+        began = time.perf_counter()
         speed = measure_speed(work.job(work.out / ".trial"))
         steps, seconds = work.cfg.steps, speed.step
         if steps is None:
-            spent = sum(work.stages.seconds.values())
+            spent = sum(work.stages.seconds.values()) + time.perf_counter() - began
             room = 60 * work.cfg.budget_minutes - spent - work.rest(speed)
             steps, seconds = choose_steps(room, speed.step)
         work.stages.keep(steps=int(steps), seconds_per_step=seconds, seconds_per_image=speed.image)
