@@ -50,6 +50,8 @@ def test_what_is_left_is_the_time_of_the_stages_that_are_not_done(tmp_path: Path
     assert work.rest(speed) == 0
     cfg.test_frames = 30  # the test is to be made again
     assert work.rest(speed) == 30 + 25
+    cfg.test_frames = 500  # of 120 that are rendered
+    assert work.rest(speed) == 120 + 25
 
 
 def test_the_time_of_measuring_is_not_given_to_the_training(

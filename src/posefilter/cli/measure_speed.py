@@ -41,6 +41,7 @@ def measure_speed(job: Job) -> Speed:
     clock = LambdaCallback(on_train_batch_end=lambda *_: times.append(time.perf_counter()))
     try:
         run = build(trial)
+        run.method.to(run.trainer.strategy.root_device)  # as the fit does, which comes later
         images = [_time(lambda: look_once(run.method, run.data)) for _ in range(_IMAGES)]
         run.trainer.callbacks.append(clock)  # type: ignore[attr-defined]
         run.trainer.fit(run.method, datamodule=run.data)

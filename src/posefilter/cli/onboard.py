@@ -195,7 +195,8 @@ class Onboarding:
         """Return how long what follows the training, and is not done, takes [s]."""
         # frames with and without the object, run twice; doubtful ones, up to three times more each
         searches = 10 * min(_CALIBRATED, self.frames // 10)
-        images = {"train": _VALIDATED, "calibrate": searches, "test": int(self.cfg.test_frames)}
+        tested = min(int(self.cfg.test_frames), _TEST_FRAMES)  # which are rendered at most
+        images = {"train": _VALIDATED, "calibrate": searches, "test": tested}
         ahead = [one.name for one in STAGES if not self.is_done(one)]
         seconds = speed.image * sum(images.get(name, 0) for name in ahead)
         return float(seconds + (_REST if ahead else 0.0))

@@ -4,12 +4,13 @@ A space perturbs, averages and compares states.
 """
 
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import ClassVar
 
 import torch
 from torch import Tensor
 
+from posefilter import cuda_graphs
 from posefilter.geometry import fused_moves
 from posefilter.geometry.pose import move_about, origin_of, pose_about, rotation_of
 from posefilter.geometry.rotation import angle_between, project_to_so3
@@ -36,6 +37,15 @@ class PixelSpace:
     def distance(self, a: Tensor, b: Tensor) -> Tensor:
         """Return the Euclidean distance.  (*, 2) x 2 -> (*) [px]."""
         return (a - b).norm(dim=-1)
+
+
+_RECORDINGS = cuda_graphs.Recordings()
+
+
+@lru_cache(maxsize=64)
+def _to_device(center: tuple[float, ...], dtype: torch.dtype, device: torch.device) -> Tensor:
+    """Return a point as a tensor, made once: a GPU is waited for when one is sent to it."""
+    return torch.tensor(center, dtype=dtype, device=device)
 
 
 @dataclass(frozen=True)
@@ -77,7 +87,11 @@ class PoseSpace:
         """
         if fused_moves.applies(state, tangent):
             return fused_moves.move(state, tangent, self.center)
-        return move_about(state, tangent, state.new_tensor(self.center))
+        center = _to_device(self.center, state.dtype, state.device)
+        if not cuda_graphs.applies(state, tangent):
+            return move_about(state, tangent, center)
+        key = cuda_graphs.describe(state, tangent)
+        return _RECORDINGS.get(key)(move_about, state, tangent, center)
 
     def noise_scale(self, sigma: Tensor) -> Tensor:
         """Return the standard deviation along each axis of a perturbation of size sigma [m].

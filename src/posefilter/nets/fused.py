@@ -9,11 +9,13 @@ GPU as many as bound its memory.
 """
 
 import math
+from functools import lru_cache
 from typing import TYPE_CHECKING, NamedTuple
 
 import torch
 from torch import Tensor, nn
 
+from posefilter import cuda_graphs
 from posefilter.errors import UserError
 from posefilter.geometry.camera import project
 from posefilter.geometry.lookup import argmin
@@ -53,6 +55,43 @@ def missing_context() -> UserError:
         "model/proposals=dense or "
         "model/likelihood=pointwise"
     )
+
+
+def score_on_gpu(
+    likelihood: "PoseLikelihood",
+    image: "Pixels",
+    poses: Tensor,
+    sigma: Tensor,
+    center: Tensor,
+    radius: float,
+    noise: Tensor,
+    dtype: torch.dtype,
+) -> Tensor:
+    """Score poses with the term of their surfaces, as a graph where that has been recorded.
+
+    Arguments and result as of `score`; the term is the one of `PoseLikelihood.judge_surface`.
+    """
+    context, tables = image.context, image.tables
+    if context is not None and tables is None:
+        tables = make_tables(context)
+    parts = [poses, sigma, center, noise, image.values, image.intrinsics]
+    if context is not None and tables is not None:
+        parts += [context.smooth, context.centers, *tables]
+
+    def work(poses: Tensor, sigma: Tensor, center: Tensor, noise: Tensor, *rest: Tensor) -> Tensor:
+        own = image._replace(values=rest[0], intrinsics=rest[1])
+        if context is not None:
+            inner = context._replace(smooth=rest[2], centers=rest[3])
+            own = own._replace(context=inner, tables=Tables(*rest[4:]))
+        found = score(likelihood, own, poses, sigma, center, radius, noise, dtype)
+        return found + likelihood.judge_surface(own, poses, sigma, center, radius)
+
+    if not cuda_graphs.applies(*parts):
+        return work(*parts)
+    grid = None if context is None else (context.grid, context.columns)
+    key = (image.size, grid, radius, dtype, likelihood.ray, cuda_graphs.describe(*parts))
+    learned = [*likelihood.parameters(), *likelihood.buffers()]
+    return RECORDINGS.get(likelihood, learned, key, cuda_graphs.Recording)(work, *parts)
 
 
 def make_tables(context: Context) -> Tables:
@@ -98,13 +137,15 @@ def score(
         tables = make_tables(image.context)
     octaves = likelihood.octaves
     inputs, cells, inside = _inputs(octaves, image, tables, poses, center, radius, noise, spread)
-    # a video asks at the same few noise levels in every frame
-    weights = CACHE.get(
-        likelihood,
-        _list_parameters(likelihood),
-        (float(sigma), dtype),
-        lambda: _Weights(likelihood, sigma, dtype),
-    )
+    if sigma.device.type == "cpu":  # a video asks at the same few noise levels in every frame
+        weights = CACHE.get(
+            likelihood,
+            _list_parameters(likelihood),
+            (float(sigma), dtype),
+            lambda: _Weights(likelihood, sigma, dtype),
+        )
+    else:  # a GPU would have to be waited for, to know the level
+        weights = _Weights(likelihood, sigma, dtype)
     context = None if tables is None else tables.smooth
     scores = weights.score(inputs.flatten(1), context, cells).view(inside.shape)
     return likelihood.pool(scores, inside, likelihood.level(sigma.reshape(1)), poses, center)
@@ -246,6 +287,12 @@ def _columns(octaves: int) -> list[int]:
     return [0, 1, 2, *waves, *(3 * octaves + i for i in waves)]
 
 
+@lru_cache(maxsize=32)
+def _to_index(columns: tuple[int, ...], device: torch.device) -> Tensor:
+    """Return columns as an index on a device."""
+    return torch.tensor(columns, dtype=torch.int64, device=device)
+
+
 def _list_parameters(likelihood: "PoseLikelihood") -> list[Tensor]:
     """Return what `_Weights` depends on; `parameters()` searches all modules, a ms a frame."""
     layers = [likelihood.enter, *likelihood.modulate, likelihood.leave]
@@ -275,8 +322,8 @@ class _Weights:
             order += [plain, *range(plain + 3, plain + 9)]
             rest = [plain + 1, plain + 2, *range(plain + 9, weight.shape[1])]
         self.dtype = dtype
-        self.enter = weight[:, order].to(dtype)
-        self.context = weight[:, rest].to(dtype)
+        self.enter = weight[:, _to_index(tuple(order), weight.device)].to(dtype)
+        self.context = weight[:, _to_index(tuple(rest), weight.device)].to(dtype)
         # the residual stream is kept without its bias, which is known: relu(x + b) = max(x, -b) + b
         stream = enter.bias * (1 + gain) + bias
         self.blocks: list[tuple[Tensor, Tensor, Tensor, Tensor]] = []
@@ -322,3 +369,4 @@ def _linear_relu(x: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
 
 _FUSES = has_onednn()
 CACHE: ModuleCache[_Weights] = ModuleCache()
+RECORDINGS: ModuleCache[cuda_graphs.Recording] = ModuleCache()

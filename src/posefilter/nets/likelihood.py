@@ -23,7 +23,7 @@ from posefilter.geometry.camera import project, rays
 from posefilter.geometry.lookup import gather_rows
 from posefilter.geometry.pose import origin_of, rotation_of
 from posefilter.nets.coordinates import Context, Coordinates, flatten_context, query
-from posefilter.nets.fused import Tables, applies, missing_context, score
+from posefilter.nets.fused import Tables, applies, missing_context, score, score_on_gpu
 from posefilter.nets.layers import ResnetFC, fourier
 from posefilter.nets.linear import Linear
 from posefilter.nets.quasi_monte_carlo import draw_quasi_random
@@ -250,6 +250,9 @@ class PoseLikelihood(nn.Module):
             half = torch.is_autocast_enabled(kind)
             dtype = torch.get_autocast_dtype(kind) if half else poses.dtype
             with torch.autocast(kind, enabled=False):
+                if kind == "cuda":
+                    own = (image, poses, sigma, center, radius, noise, dtype)
+                    return score_on_gpu(self, *own)
                 found = score(self, image, poses, sigma, center, radius, noise, dtype)
                 return found + self.judge_surface(image, poses, sigma, center, radius)
         # half precision would round poses to half a millimeter

@@ -1,0 +1,102 @@
+"""Functions of tensors that a GPU replays as CUDA graphs.
+
+A step of the filter is hundreds of operations on small tensors, each of which takes longer to start
+from Python than to compute. A graph starts them all at once. It is of fixed shapes and addresses,
+so that a call copies its tensors into those of the graph, and its result out of it.
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+import torch
+from torch import Tensor
+
+Function = Callable[..., Tensor]
+
+_pools: dict[int, Any] = {}  # of each GPU: graphs share their memory, as each result is copied
+
+
+def applies(*tensors: Tensor) -> bool:
+    """Return whether a function of these tensors may be recorded: on a GPU, without gradient."""
+    return (
+        tensors[0].device.type == "cuda"
+        and not torch.is_grad_enabled()
+        and not torch.compiler.is_compiling()
+        and not torch.cuda.is_current_stream_capturing()
+    )
+
+
+class Recording:
+    """One function at one set of shapes; its second call is recorded, and those after it replayed.
+
+    The first is not, since many shapes are met only once.
+    """
+
+    def __init__(self) -> None:
+        self._called = False
+        self._replay: Callable[[], None] | None = None
+        self._inputs: list[Tensor] = []
+        self._output: Tensor | None = None
+        self._given: list[tuple[Tensor, int]] = []  # what was copied last, kept alive, and versions
+
+    def __call__(self, function: Function, *tensors: Tensor) -> Tensor:
+        """Return the function of the tensors.
+
+        Args:
+            function: The same in each call but for what it closes over: it reads no number of a
+                tensor, draws none, and moves none between devices.
+            *tensors: All that changes from call to call; of the same shapes and types each time.
+        """
+        if not self._called:
+            self._called = True
+            return function(*tensors)
+        if self._replay is None:
+            self._inputs = [one.detach().clone() for one in tensors]
+            self._replay, self._output = capture(function, self._inputs)
+        else:
+            for own, new, (old, version) in zip(self._inputs, tensors, self._given, strict=True):
+                if new is not old or new._version != version:
+                    own.copy_(new)
+        self._given = [(one, one._version) for one in tensors]
+        self._replay()
+        assert self._output is not None
+        return self._output.clone()
+
+
+class Recordings:
+    """Recordings by key, the latest of them.
+
+    Args:
+        most: Kept at most; beyond that all are dropped.
+    """
+
+    def __init__(self, most: int = 32) -> None:
+        self._known: dict[Any, Recording] = {}
+        self._most = most
+
+    def get(self, key: Any) -> Recording:
+        """Return the recording of a key, a new one where there is none."""
+        if key not in self._known and len(self._known) >= self._most:
+            self._known.clear()
+        return self._known.setdefault(key, Recording())
+
+
+def describe(*tensors: Tensor) -> tuple[Any, ...]:
+    """Return what a recording is bound to: shapes, types and devices."""
+    return tuple((one.shape, one.dtype, one.device) for one in tensors)
+
+
+def capture(function: Function, inputs: list[Tensor]) -> tuple[Callable[[], None], Tensor]:
+    """Record a function.  -> what computes it of the inputs as they are then, and its result."""
+    device = inputs[0].device
+    current, side = torch.cuda.current_stream(device), torch.cuda.Stream(device)
+    side.wait_stream(current)
+    with torch.cuda.stream(side):
+        function(*inputs)  # libraries allocate at their first call, which a graph may not
+    current.wait_stream(side)
+    pool = _pools.setdefault(device.index or 0, torch.cuda.graph_pool_handle())
+    graph = torch.cuda.CUDAGraph()
+    # other threads, of a data loader, may use the GPU meanwhile
+    with torch.cuda.graph(graph, pool=pool, capture_error_mode="thread_local"):
+        output = function(*inputs)
+    return graph.replay, output

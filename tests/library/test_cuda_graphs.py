@@ -1,0 +1,52 @@
+"""A recording gives what its function gives, whatever changes from call to call."""
+
+import pytest
+import torch
+from tests.simulated_gpu import compute_again
+from torch import Tensor
+
+from posefilter import cuda_graphs
+
+
+@pytest.fixture(autouse=True)
+def no_gpu(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(cuda_graphs, "capture", compute_again)
+
+
+def test_every_call_has_the_result_of_its_own_tensors() -> None:
+    record, calls = cuda_graphs.Recording(), []
+
+    def work(a: Tensor, b: Tensor) -> Tensor:
+        calls.append(1)
+        return a * 2 + b
+
+    kept, found = torch.ones(3), []
+    for number in range(5):
+        found.append(record(work, kept, torch.full((3,), float(number))))
+        if number == 2:
+            kept += 1  # in place
+    assert [one[0].item() for one in found] == [2, 3, 4, 7, 8]  # and none was overwritten
+    assert len(calls) == 6  # the first, the one that is recorded, and four replays
+
+
+def test_a_view_is_copied_as_it_is() -> None:
+    record = cuda_graphs.Recording()
+    for number in range(4):
+        whole = torch.arange(12.0).view(3, 4) + number
+        parts = (whole.t(), whole[0, :1].expand(4, 3))
+        assert torch.equal(record(torch.add, *parts), parts[0] + parts[1])
+
+
+def test_recordings_are_told_apart_and_not_kept_for_ever() -> None:
+    records = cuda_graphs.Recordings(most=2)
+    a, b = torch.zeros(2), torch.zeros(2, dtype=torch.float64)
+    first = records.get(cuda_graphs.describe(a))
+    assert records.get(cuda_graphs.describe(torch.ones(2))) is first
+    assert records.get(cuda_graphs.describe(b)) is not first
+    assert records.get(cuda_graphs.describe(a, b)) is not first
+    assert records.get(cuda_graphs.describe(a)) is not first
+
+
+def test_a_cpu_records_nothing() -> None:
+    with torch.no_grad():
+        assert not cuda_graphs.applies(torch.zeros(2))
