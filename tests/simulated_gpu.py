@@ -21,6 +21,7 @@ GPU = torch.device("cuda:0")
 _Generator = torch.Generator
 _ANY_DEVICE = ("to", "copy_", "tensor", "as_tensor", "new_tensor", "set_", "type")
 _ANY_DEVICE += ("_has_compatible_shallow_copy_type",)  # asked before a module's weight is moved
+_WAITS = ("item", "tolist", "__bool__", "__float__", "__int__", "__index__", "nonzero", "cpu")
 _SHAPED_AS = ("expand_as", "view_as", "reshape_as")  # of the other tensor, only the shape is read
 _BY_INDEX = ("__getitem__", "__setitem__", "index_put_")
 
@@ -63,6 +64,8 @@ class MarkedGenerator(metaclass=_IsGenerator):
 class SimulatedGpu(TorchFunctionMode):
     """Marks tensors, and refuses what CUDA refuses."""
 
+    records: ClassVar[bool] = False  # a graph, which can neither be waited for nor be sent anything
+
     def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         """Do an operation of torch as on a GPU.
 
@@ -81,6 +84,8 @@ class SimulatedGpu(TorchFunctionMode):
         if name not in (*_ANY_DEVICE, *_SHAPED_AS):
             _check_devices(name, tensors)
         on_gpu = _find_device(name, args, kwargs, tensors)
+        if SimulatedGpu.records:
+            _check_recorded(name, on_gpu, args, tensors)
         generator = kwargs.get("generator")
         if generator is not None and (id(generator) in MarkedGenerator.of_gpu) != on_gpu:
             raise RuntimeError(f"{name}: the generator is not of the device of the numbers")
@@ -125,7 +130,11 @@ def compute_again(
     function: Callable[..., Tensor], inputs: list[Tensor]
 ) -> tuple[Callable[[], None], Tensor]:
     """Stand in for `cuda_graphs.capture`: what is replayed is computed again, into one result."""
-    output = function(*inputs)
+    SimulatedGpu.records = True
+    try:
+        output = function(*inputs)
+    finally:
+        SimulatedGpu.records = False
 
     def replay() -> None:
         output.copy_(function(*inputs))
@@ -191,6 +200,19 @@ def _check_devices(name: str, tensors: list[Tensor]) -> None:
         raise RuntimeError(
             f"{name}: Expected all tensors to be on the same device, but found cuda:0 and cpu"
         )
+
+
+def _check_recorded(name: str, on_gpu: bool, args: Any, tensors: list[Tensor]) -> None:
+    given = any(isinstance(one, Marked) for one in tensors)
+    sent = on_gpu and (
+        name in ("tensor", "as_tensor", "new_tensor") or (name == "to" and not given)
+    )
+    index = args[1] if name in _BY_INDEX else ()
+    index = index if isinstance(index, tuple) else (index,)
+    masked = any(isinstance(one, Tensor) and one.dtype == torch.bool for one in index)
+    listed = any(isinstance(one, list) for one in index)
+    if sent or masked or listed or (given and (name in _WAITS or not on_gpu)):
+        raise RuntimeError(f"{name}: cannot be recorded as a CUDA graph")
 
 
 def _read_property(name: str, func: Any, args: Any) -> Any:

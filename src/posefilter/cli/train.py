@@ -32,6 +32,7 @@ from posefilter.metrics.results import compute_checkpoint_score
 from posefilter.models.base import PoseEstimator
 from posefilter.models.rehearsal import check_method
 from posefilter.paths import stays_inside
+from posefilter.types import Batch
 
 log = logging.getLogger(__name__)
 
@@ -106,7 +107,7 @@ def look_once(method: PoseEstimator, data: PoseDataModule) -> None:
     """Run the filter on one image, as a validation will."""
     was_training = method.training
     with torch.no_grad():
-        batch = default_collate([data.val_dataset[0]])
+        batch = Batch(*(x.to(method.device) for x in default_collate([data.val_dataset[0]])))
         method.eval().box(method.predict_step(batch, 0), batch)
     method.train(was_training)
 

@@ -14,9 +14,8 @@ def make_pose(rotation: Tensor, translation: Tensor) -> Tensor:
     # not torch.broadcast_shapes, which imports sympy
     lead = torch.broadcast_tensors(rotation[..., 0], translation)[0].shape[:-1]
     top = torch.cat([rotation.expand(*lead, 3, 3), translation.expand(*lead, 3)[..., None]], dim=-1)
-    bottom = torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=top.dtype, device=top.device).expand(
-        *lead, 1, 4
-    )
+    # made on the device: a GPU that records a graph takes nothing from elsewhere
+    bottom = torch.eye(4, dtype=top.dtype, device=top.device)[3:].expand(*lead, 1, 4)
     return torch.cat([top, bottom], dim=-2)
 
 
