@@ -115,6 +115,8 @@ def simulate_gpu() -> Iterator[torch.device]:
             patch.setattr(f"posefilter.{user}.choose_device", lambda: str(GPU))
         patch.setattr("posefilter.cuda_graphs.capture", compute_again)
         patch.setattr("torch.cuda.is_current_stream_capturing", lambda: False)
+        patch.setattr("torch.cuda.get_device_name", lambda _: "simulated")
+        patch.setattr("torch.cuda.max_memory_allocated", lambda _: 0)
         patch.setattr(SingleDeviceStrategy, "root_device", property(lambda _: GPU))
         patch.setattr(CPUAccelerator, "setup_device", lambda *_: None)
         future.set_overwrite_module_params_on_conversion(True)

@@ -4,6 +4,7 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
+import torch
 
 from posefilter.callbacks import speed
 from posefilter.callbacks.speed import Speed
@@ -27,7 +28,7 @@ def test_images_waiting_and_validations_are_timed_separately(
         log_every_n_steps=4,
         callbacks=[drawer],
     )
-    method: Any = None
+    method: Any = SimpleNamespace(device=torch.device("cpu"))
     callback, batch = Speed(), [[0] * 8]
 
     def step(wait: float) -> None:

@@ -8,8 +8,9 @@ import sys
 from concurrent.futures import ProcessPoolExecutor
 
 import pytest
+import torch
 
-from posefilter.cli.machine import settle_processes
+from posefilter.cli.machine import device_name, settle_processes
 
 TEN_LARGE = """
 import resource, torch
@@ -60,3 +61,11 @@ def _run_settled() -> tuple[str, int]:
     settle_processes()
     with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as pool:
         return before, pool.submit(abs, -7).result()
+
+
+def test_a_gpu_that_was_not_used_is_not_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(torch.cuda, "get_device_name", lambda device: f"GPU {device.index}")
+    assert "threads" in device_name()
+    assert "threads" in device_name(torch.device("cpu"))
+    assert device_name(torch.device("cuda:1")) == "GPU 1"

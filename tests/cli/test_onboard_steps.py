@@ -14,6 +14,7 @@ from posefilter.cli import run_command
 from posefilter.cli.measure_speed import Speed
 from posefilter.cli.onboard import STAGES, Onboarding, choose_steps
 from posefilter.cli.stages import Stages
+from posefilter.errors import UserError
 from posefilter.meshes.builtin.catalog import build, names
 
 
@@ -95,6 +96,8 @@ def test_another_texture_mapping_is_another_mesh(tmp_path: Path) -> None:
     ("override", "told"),
     [
         ("filter/resample=below_ess", "is now filter/resample=adaptive"),
+        ("trainer.max_steps=300", "steps= sets the number"),
+        ("+trainer.val_check_interval=5", "trainer.val_check_interval follows from"),
         ("filter.partcles=20", "filter.partcles: there is no such setting"),
     ],
 )
@@ -106,3 +109,25 @@ def test_mistakes_in_overrides_are_told_before_anything_is_written(
     (line,) = capfd.readouterr().err.splitlines()
     assert told in line
     assert not (tmp_path / "out").exists()
+
+
+def test_other_symmetries_are_refused_before_they_replace_those_of_the_training(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    typed = ["mesh=banana", f"out={tmp_path / 'out'}", "console=json"]
+
+    def stop(work: Onboarding) -> None:
+        raise UserError("stopped here")
+
+    quick = {"mesh": command.store_meshes, "symmetries": command.use_symmetries}
+    stages = [stage._replace(do=quick.get(stage.name, lambda work: None)) for stage in STAGES]
+    stages = [stage._replace(do=stop) if stage.name == "export" else stage for stage in stages]
+    monkeypatch.setattr(command, "STAGES", stages)
+    assert run_command("onboard", arguments=typed) == 2
+    file = tmp_path / "out" / "meshes" / "banana" / "symmetries.json"
+    before = file.read_text()
+    assert run_command("onboard", arguments=[*typed, "symmetries=none"]) == 2
+    assert "'symmetries' was begun with other settings" in capfd.readouterr().err
+    assert file.read_text() == before
+    assert run_command("onboard", arguments=typed) == 2
+    assert capfd.readouterr().err.splitlines()[-1].endswith("stopped here")

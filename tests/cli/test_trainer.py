@@ -1,11 +1,16 @@
 """What a trainer may be told."""
 
+from pathlib import Path
+
 import pytest
+import torch
 from omegaconf import OmegaConf
 
+from posefilter.cli import run_command
 from posefilter.cli.build import make_trainer
 from posefilter.errors import UserError
 
+HOME = Path(__file__).parents[2]
 SETTINGS = {"_target_": "lightning.Trainer", "accelerator": "cpu", "max_steps": 1}
 
 
@@ -20,3 +25,25 @@ def test_full_precision_is_taken() -> None:
         make_trainer(OmegaConf.create({**SETTINGS, "precision": "32-true"}), []).precision
         == "32-true"
     )
+
+
+@pytest.mark.slow
+def test_a_training_without_end_needs_no_schedule(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    words = ["debug=smoke", "model=pixel_pf", f"data.root={tmp_path / 'data'}", "console=json"]
+    words += ["trainer.max_steps=-1", "logger=none", f"out={tmp_path / 'run'}"]
+    assert run_command("train", HOME, words) == 2
+    assert "trainer.max_steps=-1: the learning rate's schedule" in capfd.readouterr().err
+
+
+def test_a_gpu_without_memory_is_told_in_one_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    def fill(job: object) -> None:
+        raise torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 9 GiB")
+
+    monkeypatch.setattr("posefilter.cli.generate.generate", fill)
+    assert run_command("generate", HOME, [f"out={tmp_path / 'x'}"]) == 2
+    (line,) = capfd.readouterr().err.splitlines()
+    assert line.startswith("generate: out of memory")

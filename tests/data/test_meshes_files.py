@@ -336,3 +336,16 @@ def test_extensions_that_would_be_left_out_are_named(tmp_path: Path, name: str) 
     chunk = struct.pack("<II", len(content), 0x4E4F534A) + content
     (tmp_path / "a.glb").write_bytes(struct.pack("<4sII", b"glTF", 2, 12 + len(chunk)) + chunk)
     _rejects(tmp_path / "a.glb", "a.glb", name, "export it without")
+
+
+def test_a_gray_may_be_one_number_and_coordinates_must_be_numbers(tmp_path: Path) -> None:
+    (tmp_path / "m.mtl").write_text("newmtl a\nKd .5\n")
+    corners = "v 0 0 0\nv .1 0 0\nv 0 .1 0\nv 0 0 .1\nvt 0 0\nvt 1 0\nvt 0 {last}\n"
+    faces = "usemtl a\nf 1/1 2/2 3/3\nf 1/1 3/3 4/2\nf 1/1 4/2 2/3\nf 2/1 4/2 3/3\n"
+    for last, name in (("1", "good"), ("nan", "bad")):
+        text = "mtllib m.mtl\n" + corners.format(last=last) + faces
+        (tmp_path / f"{name}.obj").write_text(text)
+    mesh = read_mesh(tmp_path / "good.obj", "good")
+    np.testing.assert_allclose(mesh.texture.reshape(-1, 3)[0] / 255, 0.5, atol=0.01)
+    with pytest.raises(UserError, match=r"bad\.obj: texture coordinates or colors that are not"):
+        read_mesh(tmp_path / "bad.obj", "bad")

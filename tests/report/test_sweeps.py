@@ -198,3 +198,13 @@ def test_threads_are_an_axis_where_they_are_swept_alone(tmp_path: Path) -> None:
     asked = {"hydra": {"overrides": {"task": ["model=patch_pf", "threads=1,2"]}}}
     (tmp_path / "multirun.yaml").write_text(json.dumps(asked))
     assert read_sweep(tmp_path).axes == ["threads"]
+
+
+def test_a_run_that_was_evaluated_since_keeps_its_row(sweep: Path) -> None:
+    before = read_sweep(sweep)
+    own = sweep / before.jobs[0].folder
+    shutil.copy2(own / "metrics.json", own / "metrics_train.json")
+    others = {"add": {"auc": 1.0}, "overrides": ["checkpoint=a.ckpt", "data=ycb_video"]}
+    (own / "metrics.json").write_text(json.dumps(others))
+    after = read_sweep(sweep)
+    assert (after.axes, after.jobs) == (before.axes, before.jobs)

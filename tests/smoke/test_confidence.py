@@ -359,3 +359,18 @@ def test_methods_in_image_space_are_calibrated_too(
     assert result.presence is not None
     assert 0 < result.probability < result.presence < 1
     assert result.conformal_set(0.8).level == 0.8
+
+
+@pytest.mark.parametrize(("searches", "kept"), [(1, True), (4, False)])
+def test_an_export_keeps_the_calibration_of_a_filter_with_fewer_searches(
+    searches: int,
+    kept: bool,
+    calibrated: Path,
+    tmp_path: Path,
+    capfd: pytest.CaptureFixture[str],
+) -> None:
+    out = tmp_path / "exported.ckpt"
+    typed = [f"checkpoint={calibrated}", f"filter.max_searches={searches}", f"out={out}", QUIET[0]]
+    assert run_command("export", HOME, typed) == 0
+    assert ('"calibration": "left out"' in capfd.readouterr().out) != kept
+    assert (torch.load(out, weights_only=True).get("calibration") is not None) == kept

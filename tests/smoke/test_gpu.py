@@ -17,10 +17,13 @@ from tests.smoke.test_confidence import QUIET, calibrated, weights, without  # n
 import posefilter
 from posefilter.cli import run_command
 from posefilter.cli.job import Job
-from posefilter.cli.train import train
+from posefilter.cli.measure_speed import measure_speed
+from posefilter.cli.train import look_once, train
+from posefilter.data.module import PoseDataModule
 from posefilter.filters.texture import TextureRotations
 from posefilter.images import check_images, make_batch
-from posefilter.types import Batch
+from posefilter.models.base import PoseEstimator
+from posefilter.types import Batch, Trace
 
 HOME = Path(__file__).parents[2]
 SCENE = HOME / "docs" / "scenes" / "003_cracker_box" / "mixed" / "scene0003_0" / "000000.left"
@@ -106,18 +109,45 @@ def test_a_method_is_trained_tested_and_drawn(
     assert (tmp_path / "run" / "metrics.json").is_file()
 
 
+def test_the_speed_of_a_training_is_measured_there(
+    tiny_job: Callable[..., Job], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    devices: list[torch.device] = []
+
+    def watch(method: PoseEstimator, data: PoseDataModule) -> None:
+        look_once(method, data)
+        devices.append(method.device)
+        raise InterruptedError
+
+    monkeypatch.setattr("posefilter.cli.measure_speed.look_once", watch)
+    job = tiny_job(tmp_path / "run", "model=pixel_pf")
+    with simulate_gpu(), pytest.raises(InterruptedError):
+        measure_speed(job)
+    assert devices == [GPU]
+
+
 @pytest.mark.slow
 def test_probabilities_are_calibrated_and_evaluated(
     weights: Path,  # noqa: F811
     without: Path,  # noqa: F811
     tiny_scenes: Path,
     tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     out = tmp_path / "carton.ckpt"
     data = [f"data.root={tiny_scenes}", "data.min_visibility_test=0"]
     typed = [f"checkpoint={weights}", f"absent={without}", f"out={out}", *data, *QUIET]
     typed += ["data.split={train: 0, val: 1.0, test: 0}", "frames=12", "absent_frames=10"]
+    devices: list[torch.device] = []
+    judge = PoseEstimator.judge_confidence
+
+    def watch(self: PoseEstimator, trace: Trace, batch: Batch, present: bool = True) -> None:
+        devices.append(batch.rgb.device)
+        judge(self, trace, batch, present=present)
+
+    monkeypatch.setattr(PoseEstimator, "judge_confidence", watch)
     with simulate_gpu():
         assert run_command("calibrate", HOME, typed) == 0
         typed = [f"checkpoint={out}", *data, "data.split={test: 1.0}", *QUIET]
         assert run_command("evaluate", HOME, [*typed, f"out={tmp_path / 'test'}"]) == 0
+    assert {*devices} == {GPU}  # also of images without the object, which are judged after the test

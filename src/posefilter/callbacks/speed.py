@@ -39,21 +39,18 @@ class Speed(Callback):
         self._images += len(batch[0])
         self._steps += 1
         if self._steps >= trainer.log_every_n_steps:  # type: ignore[attr-defined]  # the logger connector sets it
-            self.write_down(trainer, self.training())
+            self.write_down(trainer, self.training() | measure_memory(pl_module.device))
             self._images = self._steps = 0
             self._waited = self._worked = 0.0
 
     def training(self) -> dict[str, float]:
         """Return the numbers since they were last logged."""
         total = max(self._waited + self._worked, 1e-9)
-        numbers = {
+        return {
             "train_images_per_second": self._images / total,
             "train_steps_per_second": self._steps / total,
             "waiting_fraction": self._waited / total,
         }
-        if torch.cuda.is_available():
-            numbers["peak_memory_gib"] = torch.cuda.max_memory_allocated() / 2**30
-        return numbers
 
     def on_validation_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Start the clock of a validation."""
@@ -91,3 +88,10 @@ class Speed(Callback):
                 logger.log_metrics(
                     {f"speed/{name}": value for name, value in numbers.items()}, trainer.global_step
                 )
+
+
+def measure_memory(device: torch.device) -> dict[str, float]:
+    """Return the most memory that was taken on a GPU so far; nothing of a CPU."""
+    if device.type != "cuda":
+        return {}
+    return {"peak_memory_gib": torch.cuda.max_memory_allocated(device) / 2**30}

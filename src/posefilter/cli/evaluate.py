@@ -103,7 +103,10 @@ def _of_checkpoint(job: Job) -> tuple[dict[str, Any], dict[str, Path]]:
     warn_of_several(data, job.cfg.console)
     records = Records()
     callbacks = [records, ErrorTable(job.folder), progress(job.cfg.console)]
-    make_trainer(job.cfg.trainer, callbacks).test(method, datamodule=data, verbose=False)
+    trainer = make_trainer(job.cfg.trainer, callbacks)
+    device = trainer.strategy.root_device
+    trainer.test(method, datamodule=data, verbose=False)
+    method.to(device)  # which Lightning has left
     files = {"beliefs": job.folder / "beliefs.npz", "errors": job.folder / ERRORS}
     judge_absent(method, data, job.cfg.absent_frames)
     native = data.reader.native_from_mesh
@@ -112,7 +115,8 @@ def _of_checkpoint(job: Job) -> tuple[dict[str, Any], dict[str, Path]]:
         write_poses_csv(files["poses"], to_rows(records.outcomes, data.records("test"), native))
     write_beliefs(files["beliefs"], records.outcomes, data.records("test"), native)
     tested = replace(job, choices={**checkpoint["recipe"]["choices"], **chosen(job)})
-    found = record(method.compute_metrics(), tested, data.describe(), Path(job.cfg.checkpoint))
+    source = Path(job.cfg.checkpoint)
+    found = record(method.compute_metrics(), tested, data.describe(), source, device)
     return found, files
 
 

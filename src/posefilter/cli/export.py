@@ -6,9 +6,9 @@ import os
 from pathlib import Path
 from typing import Any
 
-from posefilter.cli.checkpoints import method_of, read_checkpoint
+from posefilter.cli.checkpoints import is_calibrated_filter, method_of, read_checkpoint
 from posefilter.cli.components import changed, changes, chosen
-from posefilter.cli.console import ended, typed_prediction
+from posefilter.cli.console import ended, say, typed_prediction
 from posefilter.cli.evaluate import OF_THE_CHECKPOINT
 from posefilter.cli.files import pack_whole
 from posefilter.cli.job import Job
@@ -37,8 +37,9 @@ def export(job: Job) -> None:
     recipe = stripped["recipe"]
     before = recipe["settings"]
     recipe["settings"] = changed(before, changes(job.cfg))
-    if recipe["settings"] != before:  # what was calibrated is another filter
-        stripped.pop("calibration", None)
+    if not is_calibrated_filter(recipe["settings"], before) and stripped.pop("calibration", None):
+        sentence = "the calibration is left out: it was made for another filter (calibrate.py)"
+        say(job.cfg.console, "warning", sentence, calibration="left out")
     recipe["choices"] = {**recipe["choices"], **chosen(job)}
     size = write_weights(stripped, out, job.cfg.max_mb)
     following = [typed_prediction(out)]

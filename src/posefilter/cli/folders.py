@@ -120,6 +120,10 @@ def deciding(overrides: list[str]) -> list[str]:
     return sorted(typed for typed in overrides if typed.split("=", 1)[0].lstrip("+~") not in HANDS)
 
 
+# of a run's own test, after an evaluation of the same folder
+OWN_RESULTS = ("metrics_train.json", "errors_train.csv")
+
+
 def own_metrics(folder: Path) -> dict[str, Any]:
     """Return what a run's own test found, also where an evaluation has since written its own; empty
     before the test.

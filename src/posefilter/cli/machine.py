@@ -56,10 +56,10 @@ def versions() -> dict[str, str]:
     return out
 
 
-def device_name() -> str:
-    """Return the accelerator's name, or how many processor threads are used."""
-    if torch.cuda.is_available():
-        return torch.cuda.get_device_name(0)
+def device_name(device: torch.device | None = None) -> str:
+    """Return the name of the GPU that was used, or how many processor threads are."""
+    if device is not None and device.type == "cuda":
+        return torch.cuda.get_device_name(device)
     return f"{platform.machine()}, {torch.get_num_threads()} threads"
 
 

@@ -2,6 +2,7 @@
 on.
 """
 
+import math
 import time
 from collections.abc import Callable
 from contextlib import suppress
@@ -212,6 +213,11 @@ def onboard(job: Job) -> None:
     settle(cfg.threads, cfg.seed)
     if cfg.train_overrides:  # a mistake in them is told before anything is written
         overrides = [*map(str, cfg.train_overrides)]
+        for key in ("trainer.max_steps", "trainer.val_check_interval"):
+            if any(one.split("=", 1)[0].lstrip("+~") == key for one in overrides):
+                raise UserError(
+                    f"train_overrides: {key} follows from budget_minutes; steps= sets the number"
+                )
         check_choices(overrides, find_conf(), "train")
         compose_job("train", find_conf(), overrides, Path())
     mesh = read_onboarded(cfg)
@@ -221,6 +227,9 @@ def onboard(job: Job) -> None:
     for stage in STAGES:  # before anything of an earlier run is overwritten
         if stage.costly:
             work.stages.check(stage.name, work.settings_of(stage))
+    begun = {stage.name: stage for stage in STAGES if stage.name in work.stages.seconds}
+    if "train" in begun:  # which learns from the symmetries that the stage before it wrote
+        work.stages.check("symmetries", work.settings_of(begun["symmetries"]))
     for number, stage in enumerate(STAGES, 1):
         head = f"[{number}/{len(STAGES)}] {stage.doing}"
         if work.is_done(stage):
@@ -305,7 +314,8 @@ def choose_steps(room: float, step: float) -> tuple[int, float]:
 def export(work: Onboarding) -> None:
     """Write the weights that predict."""
     checkpoint = read_checkpoint(work.training / "checkpoints" / "best.ckpt")
-    write_weights(strip(checkpoint, points=_POINTS, quantize=True), work.weights, max_mb=5)
+    stripped = strip(checkpoint, points=_POINTS, quantize=True)
+    write_weights(stripped, work.weights, max_mb=math.inf)
 
 
 def calibrate(work: Onboarding) -> None:

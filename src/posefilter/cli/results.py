@@ -5,6 +5,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import torch
+
 from posefilter.cli.console import Files, ended, finite, show_table
 from posefilter.cli.job import Job
 from posefilter.cli.machine import device_name, git_state, versions
@@ -31,9 +33,15 @@ _TOLD = (
 
 
 def record(
-    results: dict[str, Any], job: Job, data: dict[str, Any], checkpoint: Path | None
+    results: dict[str, Any],
+    job: Job,
+    data: dict[str, Any],
+    checkpoint: Path | None,
+    device: torch.device | None = None,
 ) -> dict[str, Any]:
-    """Return the whole of metrics.json: what was found, and all that it takes to find it again."""
+    """Return the whole of metrics.json: what was found, where, and all that it takes to find it
+    again.
+    """
     return {
         **results,
         "model": job.choices.get("model"),
@@ -44,7 +52,7 @@ def record(
         "data": data,
         "checkpoint": str(checkpoint) if checkpoint else None,
         "git": git_state(),
-        "device": device_name(),
+        "device": device_name(device),
         "versions": versions(),
         "overrides": job.overrides,
     }

@@ -74,6 +74,8 @@ def run_job(cfg: DictConfig, name: str, begun: list[Job], kept: list[Job]) -> An
         work: Work = getattr(importlib.import_module(f"posefilter.cli.{name}"), name)
         return work(job)
     except Exception as error:
+        if type(error).__name__ == "OutOfMemoryError":  # torch's, of a GPU
+            error = MemoryError(str(error))
         if job.swept and "summary" in HydraConfig.get().callbacks:  # the other jobs go on
             if not isinstance(error, EXPECTED):
                 traceback.print_exception(error)

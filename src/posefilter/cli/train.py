@@ -18,6 +18,7 @@ from posefilter.cli.best import check_kept
 from posefilter.cli.build import build_data, build_trainer
 from posefilter.cli.checkpoints import build_method, method_of, read_checkpoint, recipe
 from posefilter.cli.console import is_installed, say, typed
+from posefilter.cli.folders import OWN_RESULTS
 from posefilter.cli.job import Job
 from posefilter.cli.machine import settle
 from posefilter.cli.ranks import is_follower
@@ -217,10 +218,13 @@ def finish(
     """
     job, file = run.job, run.job.folder / "metrics.json"
     tested = checkpoint or run.best
-    metrics = record(results, job, run.data.describe(), tested) | {"training": training}
+    device = run.trainer.strategy.root_device
+    metrics = record(results, job, run.data.describe(), tested, device) | {"training": training}
     if is_follower():
         return metrics
     write_json(file, metrics)
+    for earlier in OWN_RESULTS:  # of the run's own test, which an evaluation had moved there
+        (job.folder / earlier).unlink(missing_ok=True)
     report = typed("report", run=job.folder)
     evaluate = typed("evaluate", checkpoint=tested, **places(job), **plugins(job))
     inside = Path("outputs").resolve() in job.folder.resolve().parents

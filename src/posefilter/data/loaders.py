@@ -30,7 +30,7 @@ def spare_cores(max_cores: int = 4) -> int:
 
 
 def make_loader(
-    dataset: FrameDataset, batch_size: int, workers: int, **options: Any
+    dataset: FrameDataset, batch_size: int, workers: int, *, for_gpu: bool = False, **options: Any
 ) -> DataLoader[Batch]:
     """Return a loader that can be resumed.
 
@@ -38,6 +38,7 @@ def make_loader(
         dataset: The frames.
         batch_size: Frames of a batch.
         workers: Loader processes.
+        for_gpu: Whether batches go to a GPU by CUDA, which takes them faster from pinned memory.
         **options: Others of `DataLoader`.
 
     Raises:
@@ -59,6 +60,6 @@ def make_loader(
         num_workers=workers,
         persistent_workers=workers > 0,
         worker_init_fn=leave_signals_to_parent,
-        pin_memory=torch.cuda.is_available(),
+        pin_memory=for_gpu,
         **options,
     )

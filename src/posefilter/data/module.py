@@ -282,15 +282,31 @@ class PoseDataModule(LightningDataModule):
         place = (0, 1) if trainer is None else (trainer.global_rank, trainer.world_size)
         order = EpochShuffle(len(dataset), self._seed, dataset.set_epoch, *place)
         full = len(order) >= self._batch_size
-        return make_loader(dataset, self._batch_size, self._workers, sampler=order, drop_last=full)
+        return make_loader(
+            dataset,
+            self._batch_size,
+            self._workers,
+            for_gpu=self._goes_to_gpu,
+            sampler=order,
+            drop_last=full,
+        )
+
+    @property
+    def _goes_to_gpu(self) -> bool:
+        """Whether a trainer moves batches to a GPU by CUDA."""
+        return self.trainer is not None and self.trainer.strategy.root_device.type == "cuda"
+
+    def _make_loader_in_order(self, dataset: FrameDataset) -> DataLoader[Batch]:
+        size = self._batch_size_test
+        return make_loader(dataset, size, self._workers, for_gpu=self._goes_to_gpu)
 
     def val_dataloader(self) -> DataLoader[Batch]:
         """Return validation batches in order."""
-        return make_loader(self.val_dataset, self._batch_size_test, self._workers)
+        return self._make_loader_in_order(self.val_dataset)
 
     def test_dataloader(self) -> DataLoader[Batch]:
         """Return test batches in order."""
-        return make_loader(self.test_dataset, self._batch_size_test, self._workers)
+        return self._make_loader_in_order(self.test_dataset)
 
     def predict_dataloader(self) -> DataLoader[Batch]:
         """Return test batches in order."""

@@ -136,7 +136,7 @@ def argmin(values: Tensor) -> Tensor:
     return torch.from_numpy(values.detach().numpy().argmin(-1))
 
 
-def nearest_mask_pixel(mask: Tensor, pixels: Tensor, chunk: int = 1 << 17) -> Tensor:
+def nearest_mask_pixel(mask: Tensor, pixels: Tensor, chunk: int | None = None) -> Tensor:
     """Return the mask pixel nearest to each position; the position itself where a mask is empty.
 
     A position on the mask has its own pixel. The nearest one to any other lies on the mask's rim,
@@ -145,7 +145,7 @@ def nearest_mask_pixel(mask: Tensor, pixels: Tensor, chunk: int = 1 << 17) -> Te
     Args:
         mask: (B, 1, H, W) bool.
         pixels: (B, P, 2) positions [px].
-        chunk: Distances held at once, few enough for a CPU's cache.
+        chunk: Distances held at once; None: on a CPU as many as its cache holds, on a GPU 2^25.
 
     Returns:
         Nearest pixels (B, P, 2) [px].
@@ -155,6 +155,8 @@ def nearest_mask_pixel(mask: Tensor, pixels: Tensor, chunk: int = 1 << 17) -> Te
     rim, real = mask_pixels(mask & ~inner)
     rim = rim.to(pixels.dtype)
     square = torch.where(real, rim.square().sum(-1), torch.inf)[:, None]
+    if chunk is None:
+        chunk = 1 << (17 if pixels.device.type == "cpu" else 25)
     parts = pixels.split(max(1, chunk // rim.shape[:2].numel()), dim=1)
     # |x - r|^2 less |x|^2, which is the same for every r
     best = torch.cat(

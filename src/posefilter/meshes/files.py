@@ -58,6 +58,9 @@ def _finish(raw: RawMesh, path: Path, name: str, scale: float) -> Mesh:
         raise UserError(f"{path}: a face names a vertex that is not there (is the file cut short?)")
     if not np.isfinite(raw.vertices).all():
         raise UserError(f"{path}: vertices that are not finite numbers")
+    for part in (raw.corner_uv, raw.corner_colors):
+        if part is not None and not np.isfinite(part).all():
+            raise UserError(f"{path}: texture coordinates or colors that are not finite numbers")
     # stray vertices would spoil bounds, hull and diameter
     used, faces = np.unique(raw.faces, return_inverse=True)
     faces = faces.reshape(-1, 3).astype(np.int64)

@@ -74,9 +74,9 @@ def _read_mtl(path: Path, source: Path, images: dict[Path, np.ndarray]) -> dict[
             name = rest
             materials[name] = PLAIN
         elif key == "kd" and name:
-            materials[name] = materials[name]._replace(
-                color=np.array([float(x) for x in rest.split()[:3]])
-            )
+            color = [float(x) for x in rest.split()[:3]]
+            color = color * 3 if len(color) == 1 else color  # one number is a gray
+            materials[name] = materials[name]._replace(color=np.array(color))
         elif key == "map_kd" and name:
             # options such as -s come before the file
             file = rest.split()[-1] if rest.startswith("-") else rest

@@ -6,6 +6,7 @@ import, so that a method becomes a LightningModule only where that is needed: se
 
 import itertools
 import logging
+import math
 import time
 from collections.abc import Callable, Iterable
 from functools import cache, cached_property
@@ -353,7 +354,13 @@ class PoseEstimator(Module):
         if self.make_scheduler is None:
             return optimizer
         length = find_length(self.make_scheduler)
-        steps = int(self.trainer.estimated_stepping_batches) if length else 0
+        expected = self.trainer.estimated_stepping_batches if length else 0
+        if not math.isfinite(expected):
+            raise UserError(
+                "trainer.max_steps=-1: the learning rate's schedule goes by the number of steps; "
+                "give it, or choose scheduler=none"
+            )
+        steps = int(expected)
         scheduler = self.make_scheduler(optimizer, **({length: steps} if length else {}))
         return {
             "optimizer": optimizer,
@@ -430,6 +437,7 @@ class PoseEstimator(Module):
     def _evaluate(self, batch: Batch, stage: str, batch_number: int) -> Trace:
         start = time.perf_counter()
         trace = self._run(batch, self.generator(stage, batch_number))
+        trace.belief.best.cpu()  # waits for a GPU
         self.seconds_per_image.append((time.perf_counter() - start) / len(batch.rgb))
         self.update_metrics(trace, batch)
         return trace

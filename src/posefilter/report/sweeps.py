@@ -101,7 +101,9 @@ def read_sweep(folder: Path) -> Sweep:
 
 def read_jobs(folder: Path, found: Sequence[Path]) -> tuple[list[str], list[Job]]:
     """Return the settings in which runs differ, and the runs."""
-    metrics = [read_json(p / "failed.json") or read_json(p / "metrics.json") for p in found]
+    # first the run's own test, where an evaluation has since written beside it
+    names = ("failed.json", "metrics_train.json", "metrics.json")
+    metrics = [next((m for n in names if (m := read_json(p / n))), {}) for p in found]
     overrides = [read_texts(own, "overrides", p) for p, own in zip(found, metrics, strict=True)]
     settings = [dict(o.lstrip("+~").split("=", 1) for o in own if "=" in o) for own in overrides]
     keys = dict.fromkeys(key for pairs in settings for key in pairs)
