@@ -260,7 +260,7 @@ def list_end_to_end() -> list[Line]:
         (
             "end_to_end_held_out",
             "data.generate.frames=400 data.split.train=0.6 data.split.val=0.1 data.split.test=0.3",
-            300,
+            1000,
         ),
     ):
         patch = f"model=patch_pf {data} " + (
