@@ -55,6 +55,8 @@ class Estimator:
             if "pose" not in method.capabilities:
                 raise UserError(f"{type(method).__name__} detects, and estimates no pose")
         device = device or choose_device()
+        if str(device).split(":")[0] not in ("cpu", "cuda"):
+            raise UserError(f"device={device}: choose cpu, cuda or cuda:N; others have no float64")
         try:
             self.methods = tuple(method.to(device).eval() for method in methods)
         except (RuntimeError, AssertionError) as error:  # torch's, of devices that are not there

@@ -66,6 +66,42 @@ def test_of_equal_validations_the_latest_is_kept(
     assert [path.name for path in tmp_path.iterdir()] == ["best.ckpt"]
 
 
+@pytest.mark.parametrize("moved", [False, True])
+def test_a_run_whose_folder_was_moved_keeps_its_best(moved: bool, tmp_path: Path) -> None:
+    settings = {"filename": "best", "monitor": "val/score", "mode": "max"}
+    before, after = tmp_path / "a", tmp_path / ("b" if moved else "a")
+    before.mkdir()
+    (before / "best.ckpt").touch()
+    keep = Best(dirpath=before, **settings)
+    keep.best_model_score = keep.kth_value = torch.tensor(90.0)
+    keep.best_model_path = keep.kth_best_model_path = str(before / "best.ckpt")
+    keep.best_k_models = {keep.best_model_path: torch.tensor(90.0)}
+    state = keep.state_dict()
+    before.rename(after)
+    resumed = Best(dirpath=after, **settings)
+    resumed.load_state_dict(state)
+    trainer: Any = SimpleNamespace(
+        strategy=SimpleNamespace(reduce_boolean_decision=lambda decision, **_: decision)
+    )
+    assert resumed.best_model_path == str(after / "best.ckpt")
+    assert not resumed.check_monitor_top_k(trainer, torch.tensor(10.0))
+    assert resumed.check_monitor_top_k(trainer, torch.tensor(95.0))
+
+
+def test_a_copy_of_a_run_does_not_replace_the_best_of_the_other(tmp_path: Path) -> None:
+    settings = {"filename": "best", "monitor": "val/score", "mode": "max"}
+    for name in "ab":
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "best.ckpt").touch()
+    path = str(tmp_path / "a" / "best.ckpt")
+    state = {"dirpath": str(tmp_path / "a"), "best_k_models": {path: torch.tensor(90.0)}}
+    state |= dict.fromkeys(("best_model_path", "last_model_path", "kth_best_model_path"), path)
+    keep = Best(dirpath=tmp_path / "b", **settings)
+    with pytest.warns(UserWarning, match="dirpath"):
+        keep.load_state_dict(state)
+    assert (keep.best_model_path, keep.best_k_models) == ("", {})
+
+
 @pytest.mark.parametrize(
     ("wrong", "told"),
     [

@@ -27,6 +27,13 @@ def test_full_precision_is_taken() -> None:
     )
 
 
+def test_the_device_is_chosen_as_everywhere(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("posefilter.cli.build.choose_device", lambda: "cpu")
+    monkeypatch.setattr("torch.backends.mps.is_available", lambda: True)
+    trainer = make_trainer(OmegaConf.create({**SETTINGS, "accelerator": "auto"}), [])
+    assert trainer.strategy.root_device.type == "cpu"
+
+
 @pytest.mark.slow
 def test_a_training_without_end_needs_no_schedule(
     tmp_path: Path, capfd: pytest.CaptureFixture[str]

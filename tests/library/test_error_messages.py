@@ -22,3 +22,5 @@ def test_a_device_that_fails_without_a_message_is_refused() -> None:
     method: Any = SimpleNamespace(capabilities={"pose"}, to=fail)
     with pytest.raises(UserError, match=r"^device=cuda: cannot be used \(AssertionError\)$"):
         Estimator([method], device="cuda")
+    with pytest.raises(UserError, match=r"^device=mps: choose cpu, cuda or cuda:N"):
+        Estimator([method], device="mps")

@@ -40,26 +40,38 @@ class Best(ModelCheckpoint):
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Take over what a checkpoint says of the files that were kept, of those in this run's own
-        folder alone.
+        folder alone, also where that was moved.
 
-        Lightning deletes what it replaces, so that a foreign checkpoint could name any file.
+        Lightning deletes what it replaces, so that a foreign checkpoint could name any file. And it
+        forgets the best score of a folder of another name, so that any validation would replace it.
         """
-        kept = {
-            str(path): score
-            for path, score in dict(state_dict.get("best_k_models") or {}).items()
-            if self._own(path)
-        }
+        folder = state_dict.get("dirpath")
+        scores = dict(state_dict.get("best_k_models") or {})
+        kept = {here: one for path, one in scores.items() if (here := self._find(path, folder))}
         paths = {
-            key: state_dict.get(key, "") if self._own(state_dict.get(key)) else ""
+            key: self._find(state_dict.get(key), folder)
             for key in ("best_model_path", "last_model_path", "kth_best_model_path")
         }
-        super().load_state_dict({**state_dict, **paths, "best_k_models": kept})
+        place = {"dirpath": self.dirpath} if kept else {}
+        super().load_state_dict({**state_dict, **paths, **place, "best_k_models": kept})
 
-    def _own(self, path: Any) -> bool:
-        """Tell whether a path is that of a checkpoint in the folder that this run writes to."""
+    def _find(self, path: Any, folder: Any) -> str:
+        """Return the path of a kept checkpoint in the folder that this run writes to, "" if it is
+        elsewhere.
+
+        Args:
+            path: What a state says.
+            folder: The folder that was written to then; it may have been moved to today's.
+        """
         if not (isinstance(path, str) and path and self.dirpath) or Path(path).suffix != ".ckpt":
-            return False
-        return os.path.realpath(Path(path).parent) == os.path.realpath(self.dirpath)
+            return ""
+        parent, today = os.path.realpath(Path(path).parent), os.path.realpath(self.dirpath)
+        if parent == today:
+            return path
+        own = Path(self.dirpath) / Path(path).name
+        was_there = isinstance(folder, str) and parent == os.path.realpath(folder)
+        moved = was_there and not Path(path).exists() and own.is_file()
+        return str(own) if moved else ""
 
 
 class Last(Checkpoint):

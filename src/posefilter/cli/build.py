@@ -19,6 +19,7 @@ from posefilter.cli.plain import resolve
 from posefilter.cli.progress_bar import progress
 from posefilter.cli.stopping import Stop
 from posefilter.data.module import PoseDataModule
+from posefilter.devices import choose_device
 from posefilter.errors import UserError
 
 log = logging.getLogger(__name__)
@@ -96,6 +97,9 @@ def make_trainer(
             "leave it at 32-true (networks take bfloat16 by themselves where that is fast and "
             "safe)"
         )
+    if node.get("accelerator") == "auto":  # Lightning's takes what has no float64, too
+        node = node.copy()
+        node.accelerator = choose_device()
     trainer = instantiate(
         node,
         "trainer",

@@ -14,7 +14,7 @@ from posefilter.cli.plain import resolve, to_plain
 from posefilter.errors import UserError
 from posefilter.ranges import check_ranges
 
-_ACCELERATORS = ("auto", "cpu", "gpu", "cuda", "mps", "tpu")
+_ACCELERATORS = ("auto", "cpu", "gpu", "cuda")  # others have no float64
 # settings that a command requires a value of
 _NEEDED = {
     "train": ("model", "loss", "data", "filter", "optimizer", "trainer", "callbacks", "seed"),
