@@ -132,6 +132,28 @@ def test_a_folder_of_its_own_may_say_its_symmetries(tmp_path: Path) -> None:
     assert np.array_equal(again, read)
 
 
+def test_a_file_about_other_objects_hides_no_table(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in ("024_bowl", "my_can"):
+        _box(tmp_path / name / "textured.obj")
+    turn = {"symmetries_continuous": [{"axis": [0, 0, 1]}]}
+    (tmp_path / "symmetries.json").write_text(json.dumps({"my_can": turn}))
+    half = {"symmetries_discrete": [HALF.reshape(-1).tolist()]}
+    table = ycb.symmetries("024_bowl")
+    assert MeshStore(tmp_path).load("024_bowl").symmetries == pytest.approx(table)
+    assert len(MeshStore(tmp_path, symmetry_steps=8).load("my_can").symmetries) == 8
+    (tmp_path / "models_info.json").write_text(json.dumps({"024_bowl": half}))
+    assert len(MeshStore(tmp_path).load("024_bowl").symmetries) == 2
+    (tmp_path / "parts.json").write_text(
+        json.dumps({"my_can": {"lid": {"box": [[-9, -9, -9], [9, 9, 9]]}}})
+    )
+    known = {"rim": np.ones(12, dtype=bool)}
+    monkeypatch.setattr(ycb, "parts", lambda name, mesh: known if name == "024_bowl" else {})
+    assert set(MeshStore(tmp_path).load("024_bowl").parts) == {"rim"}
+    assert set(MeshStore(tmp_path).load("my_can").parts) == {"lid"}
+
+
 def test_bad_symmetries_are_named(tmp_path: Path) -> None:
     _box(tmp_path / "a.obj")
     for text in (

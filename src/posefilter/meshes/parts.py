@@ -50,12 +50,24 @@ def read_parts(file: Path, name: str, scale: float, mesh: Mesh) -> dict[str, np.
     table = read_json(file, _MOST_BYTES)
     if not isinstance(table, dict):
         raise UserError(f"{file}: should map names to parts; {_KINDS}")
-    alone = any(isinstance(one, dict) and {"box", "vertices"} & set(one) for one in table.values())
-    entry = table if alone else table.get(name, {})
+    entry = table if _is_of_one(table) else table.get(name, {})
     if not isinstance(entry, dict):
         raise UserError(f"{file}: '{name}' should map names of parts to parts; {_KINDS}")
     wholes = {part: _select(one, scale, mesh, f"{file}: {part}") for part, one in entry.items()}
     return assign(wholes, str(file))
+
+
+def declares_parts(file: Path, name: str) -> bool:
+    """Return whether a file in the format of `read_parts` says something of an object; one that is
+    no mapping counts as such, since reading it tells why.
+    """
+    table = read_json(file, _MOST_BYTES)
+    return not isinstance(table, dict) or name in table or _is_of_one(table)
+
+
+def _is_of_one(table: Mapping[str, object]) -> bool:
+    """Return whether a file holds the parts of one object alone."""
+    return any(isinstance(one, dict) and {"box", "vertices"} & set(one) for one in table.values())
 
 
 def assign(wholes: Mapping[str, np.ndarray], said: str) -> dict[str, np.ndarray]:

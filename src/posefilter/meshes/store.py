@@ -14,8 +14,8 @@ from posefilter.meshes import ycb
 from posefilter.meshes.builtin import catalog as builtin
 from posefilter.meshes.files import SUFFIXES, read_mesh
 from posefilter.meshes.mesh import Mesh, diameter, object_model
-from posefilter.meshes.parts import FILE, cut_part, read_parts, split_part
-from posefilter.meshes.symmetries import identity_first, read_symmetries, symmetry_group
+from posefilter.meshes.parts import FILE, cut_part, declares_parts, read_parts, split_part
+from posefilter.meshes.symmetries import declares, identity_first, read_symmetries, symmetry_group
 
 __all__ = ["Mesh", "MeshStore", "object_model", "symmetry_group"]
 
@@ -143,7 +143,7 @@ class MeshStore:
     def _parts(self, name: str, mesh: Mesh) -> dict[str, np.ndarray]:
         """Return the declared parts of an object of a folder."""
         for folder in self._folders_of(name):
-            if (folder / FILE).is_file():
+            if (folder / FILE).is_file() and declares_parts(folder / FILE, name):
                 return read_parts(folder / FILE, name, self.scale, mesh)
         return ycb.parts(name, mesh)
 
@@ -162,7 +162,7 @@ class MeshStore:
             return None
         for folder in self._folders_of(name):
             for info in (folder / "symmetries.json", folder / "models_info.json"):
-                if info.is_file():
+                if info.is_file() and declares(info, name):
                     return read_symmetries(info, name, self.scale, self.symmetry_steps)
         return ycb.symmetries(name, self.symmetry_steps)
 

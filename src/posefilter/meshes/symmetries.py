@@ -51,6 +51,27 @@ def rotation_about(axis: np.ndarray, angle: float, point: np.ndarray) -> np.ndar
     return out
 
 
+_ALONE = {"symmetries_discrete", "symmetries_continuous"}  # keys of a file for one object
+
+
+def declares(info: Path, name: str) -> bool:
+    """Return whether a file in the format of `read_symmetries` says something of an object; one
+    that cannot be read counts as such, since reading it tells why.
+    """
+    try:
+        table = read_json(info, _MOST_BYTES)
+    except (ValueError, RecursionError, UserError):
+        return True
+    plain = isinstance(table, dict)
+    return not plain or bool({*_list_keys(name)} & set(table) or _ALONE & set(table))
+
+
+def _list_keys(name: str) -> list[str]:
+    """Return what an object may be called in a file."""
+    digits = "".join(c for c in name if c.isdigit())
+    return [name, digits.lstrip("0")] if name.startswith("obj_") else [name]
+
+
 def read_symmetries(info: Path, name: str, scale: float, steps: int) -> np.ndarray:
     """Read an entry of BOP's models_info.json (or a symmetries.json of the same kind), lengths in
     the mesh file's unit.
@@ -59,10 +80,8 @@ def read_symmetries(info: Path, name: str, scale: float, steps: int) -> np.ndarr
         table = read_json(info, _MOST_BYTES)
         if not isinstance(table, dict):
             raise ValueError("no mapping of names")
-        digits = "".join(c for c in name if c.isdigit())
-        keys = [name, digits.lstrip("0")] if name.startswith("obj_") else [name]
-        alone = table if {"symmetries_discrete", "symmetries_continuous"} & set(table) else {}
-        entry = next((table[k] for k in keys if k in table), alone)
+        alone = table if _ALONE & set(table) else {}
+        entry = next((table[k] for k in _list_keys(name) if k in table), alone)
         discrete = [
             np.array(m, dtype=np.float64).reshape(4, 4)
             for m in entry.get("symmetries_discrete", [])
