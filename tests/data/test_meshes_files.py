@@ -349,3 +349,31 @@ def test_a_gray_may_be_one_number_and_coordinates_must_be_numbers(tmp_path: Path
     np.testing.assert_allclose(mesh.texture.reshape(-1, 3)[0] / 255, 0.5, atol=0.01)
     with pytest.raises(UserError, match=r"bad\.obj: texture coordinates or colors that are not"):
         read_mesh(tmp_path / "bad.obj", "bad")
+
+
+def _export_glb(path: Path, picture: np.ndarray, uv: bool) -> None:
+    """Write a tetrahedron with a picture, with texture coordinates or without."""
+    corners = np.array([[0, 0, 0], [0.1, 0, 0], [0, 0.1, 0], [0, 0, 0.1]])
+    faces = np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]])
+    material = trimesh.visual.material.PBRMaterial(baseColorTexture=Image.fromarray(picture))
+    visual = trimesh.visual.TextureVisuals(uv=corners[:, :2] * 10, material=material)
+    trimesh.Trimesh(corners, faces, visual=visual, process=False).export(path)
+    if not uv:  # under another name, a reader does not find them
+        path.write_bytes(path.read_bytes().replace(b"TEXCOORD_0", b"TEXCOORX_0"))
+
+
+def test_a_picture_of_16_bits_is_as_bright_as_one_of_8(tmp_path: Path) -> None:
+    gray = np.linspace(20, 160, 64).astype(np.uint8).reshape(8, 8)
+    _export_glb(tmp_path / "eight.glb", gray, uv=True)
+    _export_glb(tmp_path / "sixteen.glb", gray.astype(np.uint16) * 257, uv=True)
+    eight, sixteen = (read_mesh(tmp_path / f"{name}.glb", "a") for name in ("eight", "sixteen"))
+    np.testing.assert_array_equal(sixteen.texture, eight.texture)
+
+
+def test_a_picture_without_texture_coordinates_is_refused(tmp_path: Path) -> None:
+    gray = np.linspace(20, 160, 64).astype(np.uint8).reshape(8, 8)
+    _export_glb(tmp_path / "a.glb", gray, uv=False)
+    with pytest.raises(UserError, match=r"a\.glb: faces without texture coordinates"):
+        read_mesh(tmp_path / "a.glb", "a")
+    _export_glb(tmp_path / "plain.glb", np.full((8, 8), 90, dtype=np.uint8), uv=False)
+    assert read_mesh(tmp_path / "plain.glb", "plain").texture.mean() == pytest.approx(90, abs=1)

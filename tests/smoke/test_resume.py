@@ -13,7 +13,7 @@ from tests.smoke.conftest import HOME, SMALL_POSE_PF, TINY
 from posefilter.cli import build, run_command
 from posefilter.cli import train as training
 from posefilter.cli.progress_bar import Lines
-from posefilter.cli.resume import check_kept
+from posefilter.cli.resume import check_kept, with_resumed
 from posefilter.errors import UserError
 
 
@@ -262,3 +262,14 @@ def test_what_a_run_began_with_may_be_typed_again_in_other_words(tmp_path: Path)
     ):
         with pytest.raises(UserError, match="the run began with another"):
             check_kept(typed, tmp_path)
+
+
+def test_a_folder_whose_name_is_typed_in_quotes_is_resumed(tmp_path: Path) -> None:
+    folder = tmp_path / "lr=0.1,a"
+    (folder / ".hydra").mkdir(parents=True)
+    (folder / ".hydra" / "overrides.yaml").write_text("- seed=3\n")
+    (folder / "checkpoints").mkdir()
+    (folder / "checkpoints" / "last.ckpt").touch()
+    arguments = with_resumed([f"resume='{folder}'"])
+    assert arguments[0] == "seed=3"
+    assert arguments[-1] == f"out={folder}"

@@ -183,7 +183,11 @@ def _find_recorded(key: str, folder: Path) -> Any:
 def _resumed(arguments: list[str]) -> str | None:
     """Return what is to be resumed, as typed last; None where nothing is."""
     given = [a.removeprefix("resume=") for a in arguments if a.startswith("resume=")]
-    return None if not given or given[-1] in ("", "null") else given[-1]
+    if not given or given[-1] in ("", "null"):
+        return None
+    # a name with a = or a comma is typed in Hydra's quotes
+    is_quoted = given[-1][0] in "'\""
+    return str(_read_value(f"resume={given[-1]}")) if is_quoted else given[-1]
 
 
 def _key(override: str) -> str:

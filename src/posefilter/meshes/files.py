@@ -169,6 +169,8 @@ def _from_trimesh(mesh: trimesh.Trimesh, path: Path) -> RawMesh:
     if isinstance(visual, trimesh.visual.TextureVisuals):
         uv = None if visual.uv is None else np.asarray(visual.uv)[faces]
         material = _trimesh_material(visual.material)
+        if uv is None and material.image is not None and np.ptp(material.image, (0, 1)).any():
+            raise UserError(f"{path}: faces without texture coordinates have a picture")
     elif visual is not None and visual.kind == "vertex":
         colors = np.asarray(visual.vertex_colors)[:, :3][faces] / 255
         material = Material(np.ones(3), None)
@@ -193,6 +195,9 @@ def _trimesh_material(material: object) -> Material:
     factor = getattr(material, "baseColorFactor", None)
     image = getattr(material, "baseColorTexture", None) or getattr(material, "image", None)
     color = np.ones(3) if factor is None else np.asarray(factor, dtype=np.float64)[:3] / 255
+    if image is not None and image.mode.startswith("I"):  # 16 bits, which PIL would cut off at 255
+        gray = np.round(np.asarray(image, dtype=np.float64) / 257).clip(0, 255)
+        return Material(color, gray.astype(np.uint8)[..., None].repeat(3, axis=2))
     if image is not None:
         return Material(color, np.asarray(image.convert("RGB")))
     diffuse = getattr(material, "diffuse", None)
