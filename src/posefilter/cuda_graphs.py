@@ -5,6 +5,7 @@ from Python than to compute. A graph starts them all at once. It is of fixed sha
 so that a call copies its tensors into those of the graph, and its result out of it.
 """
 
+import threading
 from collections.abc import Callable
 from typing import Any
 
@@ -33,6 +34,7 @@ class Recording:
     """
 
     def __init__(self) -> None:
+        self._lock = threading.Lock()
         self._called = False
         self._replay: Callable[[], None] | None = None
         self._inputs: list[Tensor] = []
@@ -47,6 +49,10 @@ class Recording:
                 tensor, draws none, and moves none between devices.
             *tensors: All that changes from call to call; of the same shapes and types each time.
         """
+        with self._lock:  # threads share the graph's tensors
+            return self._call(function, *tensors)
+
+    def _call(self, function: Function, *tensors: Tensor) -> Tensor:
         if not self._called:
             self._called = True
             return function(*tensors)

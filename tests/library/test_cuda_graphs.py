@@ -1,5 +1,8 @@
 """A recording gives what its function gives, whatever changes from call to call."""
 
+import time
+from concurrent.futures import ThreadPoolExecutor
+
 import pytest
 import torch
 from tests.simulated_gpu import compute_again
@@ -35,6 +38,18 @@ def test_a_view_is_copied_as_it_is() -> None:
         whole = torch.arange(12.0).view(3, 4) + number
         parts = (whole.t(), whole[0, :1].expand(4, 3))
         assert torch.equal(record(torch.add, *parts), parts[0] + parts[1])
+
+
+def test_threads_do_not_take_each_others_tensors() -> None:
+    record = cuda_graphs.Recording()
+
+    def work(a: Tensor) -> Tensor:
+        time.sleep(0.002)
+        return a + 1
+
+    with ThreadPoolExecutor(4) as pool:
+        found = list(pool.map(lambda n: record(work, torch.full((2,), float(n))), range(24)))
+    assert [one[0].item() for one in found] == [n + 1 for n in range(24)]
 
 
 def test_recordings_are_told_apart_and_not_kept_for_ever() -> None:
