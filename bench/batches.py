@@ -21,6 +21,7 @@ from marked import format_row, put_table
 from torch.utils.flop_counter import FlopCounterMode
 
 import posefilter
+from posefilter.data.frames import Sample
 from posefilter.data.readers.registry import open_meshes, open_reader
 from posefilter.data.sequences import SceneVideo, VideoFrame, list_scenes
 from posefilter.memory import keep_freed_memory
@@ -67,7 +68,7 @@ def measure_peak() -> float:
     return 2 * SIZE**3 / min(take_time(lambda: a @ a)[1] for _ in range(8))
 
 
-def stack(frames: Sequence[VideoFrame]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def stack(frames: Sequence[VideoFrame | Sample]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return frames as a batch."""
     parts = [(one.rgb, one.depth, one.intrinsics) for one in frames]
     rgb, depth, intrinsics = (np.stack(part) for part in zip(*parts, strict=True))

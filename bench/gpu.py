@@ -20,8 +20,8 @@ from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
+from batches import stack
 from held_out import bootstrap, read_frames
 from marked import format_row, put_table
 
@@ -33,7 +33,6 @@ from posefilter.images import check_images, make_batch
 from posefilter.metrics.errors import add, add_s
 from posefilter.metrics.scores import auc
 from posefilter.models.base import PoseEstimator
-from posefilter.models.pose_pf import PosePF
 from posefilter.nets import fused
 from posefilter.nets.likelihood import sample_points
 from posefilter.types import Batch
@@ -56,15 +55,6 @@ Rows = list[list[str]]
 def load(name: str, device: str, *overrides: str) -> posefilter.Estimator:
     """Return an estimator on a device."""
     return posefilter.load(name, overrides=overrides, device=device)
-
-
-def take_batch(samples: Sequence[Sample]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return color, depth and intrinsics of some samples, a stack each."""
-    return (
-        np.stack([one.rgb for one in samples]),
-        np.stack([one.depth for one in samples]),
-        np.stack([one.intrinsics for one in samples]),
-    )
 
 
 def clock(call: Callable[[], Any], repeats: int) -> float:
@@ -180,16 +170,16 @@ def run_filter(method: PoseEstimator, batch: Batch) -> None:
         method.filter(batch, method, method.generator("predict", 0))
 
 
-def build_paper() -> PosePF:
+def build_paper() -> PoseEstimator:
     """Return the paper's fifth method, untrained: what it costs does not depend on its weights."""
-    config = posefilter.compose(["model=pose_pf", "variant=paper", "model.pixels=256"])
-    return posefilter.build(config)  # type: ignore[return-value]
+    config = posefilter.compose(["model=pose_pf", "variant=paper", f"model.pixels={POINTS}"])
+    return posefilter.build(config)
 
 
 def measure_times(name: str, frames: Sequence[tuple[str, Sample]], repeats: int) -> Rows:
     """Return the times of searches on both."""
     samples = [one for _, one in frames[:8]]
-    stacked = take_batch(samples)
+    stacked = stack(samples)
     single = tuple(part[0] for part in stacked)
     found: dict[str, dict[str, float]] = {}
     for device in ("cuda", "cpu"):
@@ -259,7 +249,7 @@ def main() -> None:
         for name in options.only
     }
     name, first = next(iter(frames.items()))
-    rows: dict[str, Any] = {"device": device_name(), "versions": versions()}
+    rows: dict[str, Any] = {"device": device_name(torch.device("cuda")), "versions": versions()}
     rows["gpu times"] = measure_times(name, first, options.repeats)
     rows["gpu scores"] = compare_scores(name, first[0][1])
     rows["gpu estimates"] = [

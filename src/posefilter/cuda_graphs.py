@@ -7,6 +7,7 @@ so that a call copies its tensors into those of the graph, and its result out of
 
 import threading
 from collections.abc import Callable
+from functools import lru_cache
 from typing import Any
 
 import torch
@@ -69,22 +70,11 @@ class Recording:
         return self._output.clone()
 
 
-class Recordings:
-    """Recordings by key, the latest of them.
-
-    Args:
-        most: Kept at most; beyond that all are dropped.
+def make_recordings(most: int = 32) -> Callable[[Any], Recording]:
+    """Return what finds the recording of a key, or makes one; the least used of too many are
+    dropped.
     """
-
-    def __init__(self, most: int = 32) -> None:
-        self._known: dict[Any, Recording] = {}
-        self._most = most
-
-    def get(self, key: Any) -> Recording:
-        """Return the recording of a key, a new one where there is none."""
-        if key not in self._known and len(self._known) >= self._most:
-            self._known.clear()
-        return self._known.setdefault(key, Recording())
+    return lru_cache(maxsize=most)(lambda key: Recording())
 
 
 def describe(*tensors: Tensor) -> tuple[Any, ...]:

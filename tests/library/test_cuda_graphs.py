@@ -53,13 +53,13 @@ def test_threads_do_not_take_each_others_tensors() -> None:
 
 
 def test_recordings_are_told_apart_and_not_kept_for_ever() -> None:
-    records = cuda_graphs.Recordings(most=2)
+    find = cuda_graphs.make_recordings(most=2)
     a, b = torch.zeros(2), torch.zeros(2, dtype=torch.float64)
-    first = records.get(cuda_graphs.describe(a))
-    assert records.get(cuda_graphs.describe(torch.ones(2))) is first
-    assert records.get(cuda_graphs.describe(b)) is not first
-    assert records.get(cuda_graphs.describe(a, b)) is not first
-    assert records.get(cuda_graphs.describe(a)) is not first
+    first = find(cuda_graphs.describe(a))
+    assert find(cuda_graphs.describe(torch.ones(2))) is first
+    assert find(cuda_graphs.describe(b)) is not first
+    assert find(cuda_graphs.describe(a, b)) is not first
+    assert find(cuda_graphs.describe(a)) is not first
 
 
 def test_a_cpu_records_nothing() -> None:

@@ -12,7 +12,7 @@ import torch
 from tests.simulated_gpu import GPU, simulate_gpu
 from tests.smoke.conftest import SMALL_POSE_PF
 from tests.smoke.test_comparisons import FEW
-from tests.smoke.test_confidence import QUIET, calibrated, weights, without  # noqa: F401
+from tests.smoke.test_confidence import QUIET, weights, without  # noqa: F401
 
 import posefilter
 from posefilter.cli import run_command

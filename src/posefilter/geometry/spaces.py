@@ -39,7 +39,7 @@ class PixelSpace:
         return (a - b).norm(dim=-1)
 
 
-_RECORDINGS = cuda_graphs.Recordings()
+_find_recording = cuda_graphs.make_recordings()
 
 
 @lru_cache(maxsize=64)
@@ -90,8 +90,8 @@ class PoseSpace:
         center = _to_device(self.center, state.dtype, state.device)
         if not cuda_graphs.applies(state, tangent):
             return move_about(state, tangent, center)
-        key = cuda_graphs.describe(state, tangent)
-        return _RECORDINGS.get(key)(move_about, state, tangent, center)
+        record = _find_recording(cuda_graphs.describe(state, tangent))
+        return record(move_about, state, tangent, center)
 
     def noise_scale(self, sigma: Tensor) -> Tensor:
         """Return the standard deviation along each axis of a perturbation of size sigma [m].

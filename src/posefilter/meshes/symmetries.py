@@ -60,7 +60,7 @@ def declares(info: Path, name: str) -> bool:
     """
     try:
         table = read_json(info, _MOST_BYTES)
-    except (ValueError, RecursionError, UserError):
+    except UserError:
         return True
     plain = isinstance(table, dict)
     return not plain or bool({*_list_keys(name)} & set(table) or _ALONE & set(table))

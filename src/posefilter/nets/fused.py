@@ -71,16 +71,14 @@ def score_on_gpu(
 
     Arguments and result as of `score`; the term is the one of `PoseLikelihood.judge_surface`.
     """
-    context, tables = image.context, image.tables
-    if context is not None and tables is None:
-        tables = make_tables(context)
+    context, tables = image.context, _find_tables(likelihood, image)
     parts = [poses, sigma, center, noise, image.values, image.intrinsics]
     if context is not None and tables is not None:
         parts += [context.smooth, context.centers, *tables]
 
     def work(poses: Tensor, sigma: Tensor, center: Tensor, noise: Tensor, *rest: Tensor) -> Tensor:
         own = image._replace(values=rest[0], intrinsics=rest[1])
-        if context is not None:
+        if context is not None and tables is not None:
             inner = context._replace(smooth=rest[2], centers=rest[3])
             own = own._replace(context=inner, tables=Tables(*rest[4:]))
         found = score(likelihood, own, poses, sigma, center, radius, noise, dtype)
@@ -101,6 +99,17 @@ def make_tables(context: Context) -> Tables:
     smooth = torch.cat([torch.sigmoid(logit), logit / 8, features], dim=-1)
     fragments = torch.cat([share, share * context.position.flatten(0, 1)], dim=-1)
     return Tables(fragments, smooth.flatten(0, 1))
+
+
+def _find_tables(likelihood: "PoseLikelihood", image: "Pixels") -> Tables | None:
+    """Return the images' tables, made now where they were not before; None for a likelihood without
+    context.
+    """
+    if image.tables is not None or likelihood.context is None:
+        return image.tables
+    if image.context is None:
+        raise missing_context()
+    return make_tables(image.context)
 
 
 def score(
@@ -130,11 +139,7 @@ def score(
     Returns:
         Log-likelihoods (B, N).
     """
-    tables = image.tables
-    if tables is None and likelihood.context is not None:
-        if image.context is None:
-            raise missing_context()
-        tables = make_tables(image.context)
+    tables = _find_tables(likelihood, image)
     octaves = likelihood.octaves
     inputs, cells, inside = _inputs(octaves, image, tables, poses, center, radius, noise, spread)
     if sigma.device.type == "cpu":  # a video asks at the same few noise levels in every frame
