@@ -1,11 +1,13 @@
 """A training with a time budget ends on time, and its schedule with it."""
 
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 import torch
 from lightning import LightningModule, Trainer
 from torch import nn
+from torch.optim.lr_scheduler import OneCycleLR
 from torch.utils.data import DataLoader, TensorDataset
 
 from posefilter.callbacks import time_budget
@@ -15,16 +17,21 @@ from posefilter.models.lr_schedulers import warmup_cosine
 
 
 class Line(LightningModule):
-    """A line, with the schedule of a training of `steps` steps; each step takes a second."""
+    """A line, with the schedule of a training of `steps` steps."""
 
-    def __init__(self, steps: int, clock: list[float]) -> None:
+    def __init__(
+        self, steps: int, clock: list[float], seconds: Callable[[int], float], one_cycle: bool
+    ) -> None:
         super().__init__()
         self.layer, self.steps, self.clock = nn.Linear(1, 1), steps, clock
+        self.seconds, self.one_cycle = seconds, one_cycle
         self.rates: list[float] = []
+        self.time_spent, self.spent = 0.0, list[float]()  # the budget's share, at each step
         self.validations = 0
 
     def training_step(self, batch: list[torch.Tensor], _: int) -> torch.Tensor:
-        self.clock[0] += 1.0
+        self.clock[0] += self.seconds(self.global_step)
+        self.spent.append(self.time_spent)
         self.rates.append(self.optimizers().param_groups[0]["lr"])  # type: ignore[union-attr]
         return self.layer(batch[0]).square().mean()
 
@@ -33,7 +40,11 @@ class Line(LightningModule):
 
     def configure_optimizers(self) -> dict:  # type: ignore[override]
         optimizer = torch.optim.SGD(self.parameters(), lr=1.0)
-        scheduler = warmup_cosine(optimizer, self.steps)
+        scheduler = (
+            OneCycleLR(optimizer, 1.0, total_steps=self.steps)
+            if self.one_cycle
+            else warmup_cosine(optimizer, self.steps)
+        )
         return {
             "optimizer": optimizer,
             "lr_scheduler": {"scheduler": scheduler, "interval": "step"},
@@ -41,12 +52,19 @@ class Line(LightningModule):
 
 
 def run(
-    folder: Path, monkeypatch: pytest.MonkeyPatch, steps: int, budget: TimeBudget, **more: object
+    folder: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    steps: int,
+    budget: TimeBudget,
+    seconds: Callable[[int], float] = lambda _: 1.0,
+    one_cycle: bool = False,
+    **more: object,
 ) -> Line:
     clock = [0.0]
     name = {"wall": "perf_counter", "cpu": "process_time"}[budget.clock]
     monkeypatch.setattr(time_budget.time, name, lambda: clock[0])
-    line, data = Line(steps, clock), DataLoader(TensorDataset(torch.ones(4, 1)), batch_size=1)
+    line = Line(steps, clock, seconds, one_cycle)
+    data = DataLoader(TensorDataset(torch.ones(4, 1)), batch_size=1)
     trainer = Trainer(
         default_root_dir=folder,
         max_steps=int(more.get("stop", steps)),  # type: ignore[call-overload]
@@ -82,6 +100,31 @@ def test_a_slow_machine_ends_on_time_with_the_rate_decayed(
     assert line.rates[-1] < 0.1
     assert line.rates[1:] == sorted(line.rates[1:], reverse=True)
     assert line.validations == 4  # once, as after the last step
+
+
+def test_a_schedule_that_was_advanced_is_not_taken_beyond_its_end(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # slow at first, so that the clock advances the schedule, and then as fast as was measured
+    line = run(
+        tmp_path,
+        monkeypatch,
+        20,
+        TimeBudget(20.0),
+        seconds=lambda step: 4.0 if step < 3 else 0.5,
+        one_cycle=True,  # raises where it is taken further
+    )
+    assert 3 < len(line.rates) < 20
+    assert line.rates[-1] < 0.01
+
+
+def test_stages_of_the_losses_keep_pace_with_the_clock(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    line = run(tmp_path, monkeypatch, 20, TimeBudget(8.0), stop=4)
+    assert line.spent == [0.0, 1 / 8, 2 / 8, 3 / 8]
+    again = run(tmp_path, monkeypatch, 20, TimeBudget(8.0), resume=tmp_path / "last.ckpt")
+    assert again.spent == [4 / 8, 5 / 8, 6 / 8, 7 / 8]  # and not by its steps, of 20
 
 
 def test_processor_time_is_a_clock_of_its_own(

@@ -3,6 +3,7 @@
 import sys
 from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -271,6 +272,11 @@ def test_stages_change_the_weights_as_training_proceeds() -> None:
     losses = method.training_losses(batch, method.generator("train", 0))
     assert losses["displacement"].sum() == 0
     assert losses["own_point"].sum() > 0
+    timed = working(with_lightning(PatchPF), 3, loss_schedule=loss_schedule)
+    timed._trainer = SimpleNamespace(estimated_stepping_batches=100, global_step=10)
+    assert timed.progress() == 0.1
+    timed.time_spent = 0.5  # of a time budget, whichever is more
+    assert timed.progress() == 0.5
     with pytest.raises(UserError, match="names the loss 'moton'"):
         working(PatchPF, 3, loss_schedule=(Stage(1.0, {"moton": 0.0}),))
     with pytest.raises(UserError, match="the ends must rise"):

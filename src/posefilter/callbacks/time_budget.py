@@ -3,7 +3,7 @@
 import time
 from typing import Any
 
-from lightning import Callback, LightningModule, Trainer
+from lightning import Callback, Trainer
 
 from posefilter.errors import UserError
 
@@ -16,7 +16,9 @@ class TimeBudget(Callback):
 
     The number of steps is chosen from a measured speed. On a machine that turns out slower, the
     schedule is advanced by more than one step at a time, so that it ends when the time does; a
-    validation follows, as after the last step. Time of earlier sittings counts.
+    validation follows, as after the last step. A schedule that was advanced ends the training, too,
+    if the machine becomes faster again: no step can be taken back. The stages of the losses keep
+    the same pace (`PoseEstimator.time_spent`). Time of earlier sittings counts.
 
     Args:
         seconds: For all steps, validations not counted as steps but as time.
@@ -53,18 +55,22 @@ class TimeBudget(Callback):
         """Take over the time of earlier sittings."""
         self.spent = float(state_dict["spent"])
 
-    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+    def on_train_start(self, trainer: Trainer, pl_module: Any) -> None:
         """Start the clock."""
         self._began = self.now()
+        pl_module.time_spent = self.spent / self.seconds
 
-    def on_train_batch_end(self, trainer: Trainer, pl_module: LightningModule, *_: Any) -> None:
+    def on_train_batch_end(self, trainer: Trainer, pl_module: Any, *_: Any) -> None:
         """Advance the schedule to where the clock is; stop if the time is up."""
         share = min(1.0, self.elapsed / self.seconds)
         if trainer.world_size > 1:  # their clocks differ, and their weights must not
             share = trainer.strategy.broadcast(share)
+        pl_module.time_spent = share
+        ended = share == 1
         for config in trainer.lr_scheduler_configs:
             scheduler: Any = config.scheduler
             while scheduler.last_epoch < int(share * trainer.max_steps):
                 scheduler.step()
-        if share == 1:
+            ended |= 0 < trainer.max_steps <= scheduler.last_epoch
+        if ended:
             trainer.should_stop = True

@@ -107,6 +107,7 @@ class PoseEstimator(Module):
         self.seconds_per_image: list[float] = []
         self.last_belief: BeliefBatch | None = None  # of the batch that the metrics took in last
         self.skipped_steps = self.skipped_in_a_row = 0  # whose gradient was not finite
+        self.time_spent = 0.0  # share of the training's time budget, where it has one
         self.recipe: dict[str, Any] = {}  # how it was built: plain data, carried in its checkpoints
 
     @cached_property

@@ -235,10 +235,13 @@ class ImageSpace(PoseEstimator):
         return {name: weights.get(name, 1.0) * value for name, value in losses.items()}
 
     def progress(self) -> float:
-        """Return the fraction of the training's steps done; 0 without a trainer or a schedule."""
+        """Return the fraction of the training that is done, by its steps or by its time budget,
+        whichever is more; 0 without a trainer or a schedule.
+        """
         if self._trainer is None or not self.loss_schedule:
             return 0.0
-        return self.global_step / max(1.0, float(self.trainer.estimated_stepping_batches))
+        done = self.global_step / max(1.0, float(self.trainer.estimated_stepping_batches))
+        return max(done, self.time_spent)
 
     def set_object(self, object_model: ObjectModel) -> None:
         """Set the object of the pose head too."""
