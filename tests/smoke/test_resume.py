@@ -13,7 +13,7 @@ from tests.smoke.conftest import HOME, SMALL_POSE_PF, TINY
 from posefilter.cli import build, run_command
 from posefilter.cli import train as training
 from posefilter.cli.progress_bar import Lines
-from posefilter.cli.resume import check_kept, with_resumed
+from posefilter.cli.resume import check_kept, check_override, list_unkept, with_resumed
 from posefilter.errors import UserError
 
 
@@ -273,3 +273,44 @@ def test_a_folder_whose_name_is_typed_in_quotes_is_resumed(tmp_path: Path) -> No
     arguments = with_resumed([f"resume='{folder}'"])
     assert arguments[0] == "seed=3"
     assert arguments[-1] == f"out={folder}"
+
+
+def test_a_job_of_a_chosen_sweep_is_resumed_by_itself(tmp_path: Path) -> None:
+    job = tmp_path / "ablation=paper,sweep=ablation"
+    (job / ".hydra").mkdir(parents=True)
+    (job / ".hydra" / "overrides.yaml").write_text("- ablation=paper\n- sweep=ablation\n")
+    (job / "checkpoints").mkdir()
+    (job / "checkpoints" / "last.ckpt").touch()
+    arguments = with_resumed([f"resume='{job}'"])
+    # the choice of the sweep brings settings of its jobs, and would start all of them
+    assert arguments == [
+        *("ablation=paper", "sweep=ablation"),
+        *(f"resume='{job}'", f"out={job}", "hydra.mode=RUN"),
+    ]
+
+
+def test_what_a_record_may_not_bring_is_named_as_it_is_to_be_typed(tmp_path: Path) -> None:
+    brought = ["model=patch_pf", "data.root=data/mine", "callbacks=checkpoints", "out=/elsewhere"]
+    refused = ["logger=wandb", "logger=[csv,wandb]", "data.root=/mine/two words"]
+    assert list_unkept(brought, tmp_path) == []
+    assert list_unkept([*brought, *refused], tmp_path) == [
+        *("logger=wandb", "'logger=[csv,wandb]'", "'data.root=/mine/two words'"),
+    ]
+    for one in refused:
+        with pytest.raises(UserError, match=f"its {one.partition('=')[0]}="):
+            check_override(one, tmp_path)
+
+
+@pytest.mark.slow
+def test_a_run_is_resumed_where_what_it_began_with_is_gone(
+    uninterrupted: tuple[list[str], Path], tiny_scenes: Path, tmp_path: Path
+) -> None:
+    settings, whole = uninterrupted
+    first, cut = tmp_path / "first.ckpt", tmp_path / "cut"
+    first.write_bytes((whole / "checkpoints" / "best.ckpt").read_bytes())
+    begun = [*settings, f"warm_start={first}", f"out={cut}", "trainer.max_steps=3"]
+    assert run_command("train", HOME, begun) == 0
+    first.unlink()
+    again = [f"resume={cut}", f"data.root={tiny_scenes}", f"warm_start={first}"]
+    assert run_command("train", HOME, [*again, "trainer.max_steps=6"]) == 0
+    assert state(cut)["global_step"] == 6

@@ -60,7 +60,7 @@ def check_files(command: str, cfg: DictConfig) -> None:
             _find_all(cfg.checkpoint)
         else:
             find_weights(cfg.checkpoint)
-    if command in ("train", "onboard") and cfg.warm_start:
+    if command in ("train", "onboard") and cfg.warm_start and not cfg.get("resume"):
         try:
             _find_all(cfg.warm_start)
         except UserError as error:

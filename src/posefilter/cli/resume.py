@@ -1,6 +1,7 @@
 """Going on with a run that was cut short: the same settings, from its last checkpoint."""
 
 import re
+import shlex
 from pathlib import Path
 from typing import Any
 
@@ -76,7 +77,9 @@ def with_resumed(arguments: list[str]) -> list[str]:
     kept = [one for one in before if _key(one) not in named and _key(one) not in _DROPPED]
     for override in kept:
         check_override(override, folder)
-    return [*kept, *arguments, f"out={folder}"]
+    # a choice of `sweep` brings the jobs' settings, and would start them all
+    alone = ["hydra.mode=RUN"] if any(_key(one) == "sweep" for one in kept) else []
+    return [*kept, *arguments, f"out={folder}", *alone]
 
 
 def keep_record(arguments: list[str]) -> dict[Path, bytes]:
@@ -126,7 +129,8 @@ def check_override(override: str, folder: Path) -> None:
             f"resume={folder}: its {key} calls a function; if that is right, type "
             f"{key}=... yourself"
         )
-    if (key == "logger" and value in _SENDING) or key.startswith("logger."):
+    sent = key == "logger" and any(name in re.split(r"[\[\],'\"\s]+", value) for name in _SENDING)
+    if sent or key.startswith("logger."):
         raise UserError(
             f"resume={folder}: its {key}={value} may send results elsewhere; if it is right, "
             f"type it as well"
@@ -138,6 +142,22 @@ def check_override(override: str, folder: Path) -> None:
             f"resume={folder}: its {key}={value} lies outside of the working folder; if it is "
             f"right, type it as well"
         )
+
+
+def list_unkept(overrides: list[str], folder: Path) -> list[str]:
+    """Return those overrides of a run that must be typed again to resume it, see `check_override`,
+    as they are typed in a shell.
+    """
+
+    def is_kept(override: str) -> bool:
+        try:
+            check_override(override, folder)
+        except UserError:
+            return False
+        return True
+
+    own = [one for one in overrides if _key(one) not in _DROPPED]
+    return [shlex.quote(one) for one in own if not is_kept(one)]
 
 
 def check_kept(argument: str, folder: Path) -> None:

@@ -104,8 +104,7 @@ def start_from(job: Job) -> tuple[Path | None, int]:
 
     Where the last checkpoint is broken it is the one before, and the console says so.
     """
-    begun = job.swept and any((job.folder / "checkpoints" / n).is_file() for n in (LAST, BEFORE))
-    source = job.cfg.resume or (job.folder if begun else None)
+    source = find_begun(job)
     if source is None:
         return None, 0
     last, *before = last_checkpoints(str(source))  # a folder's name may read as a number
@@ -117,6 +116,12 @@ def start_from(job: Job) -> tuple[Path | None, int]:
         sentence = f"{error}; going on from {before[0]}"
         say(job.cfg.console, "fallback", sentence, broken=last, checkpoint=before[0])
         return before[0], step_of(before[0])
+
+
+def find_begun(job: Job) -> Any:
+    """Return the run or checkpoint that a job goes on from; None where it starts anew."""
+    begun = job.swept and any((job.folder / "checkpoints" / n).is_file() for n in (LAST, BEFORE))
+    return job.cfg.resume or (job.folder if begun else None)
 
 
 def step_of(checkpoint: Path) -> int:

@@ -23,8 +23,8 @@ from posefilter.cli.job import Job
 from posefilter.cli.machine import settle
 from posefilter.cli.ranks import is_follower
 from posefilter.cli.results import record, show, write_json
-from posefilter.cli.resume import LAST
-from posefilter.cli.reuse import finished, learned_from, start_from, take_over
+from posefilter.cli.resume import LAST, list_unkept
+from posefilter.cli.reuse import find_begun, finished, learned_from, start_from, take_over
 from posefilter.cli.stopping import stopped_by_interrupt
 from posefilter.cli.warm_start import read_starts, warm_start
 from posefilter.data.module import PoseDataModule
@@ -81,7 +81,7 @@ def build(job: Job) -> Run:
     data.setup("fit")
     object_model = data.object_to_learn()
     method.set_object(object_model)
-    if job.cfg.warm_start:
+    if job.cfg.warm_start and find_begun(job) is None:  # else its own checkpoint has them
         starts = read_starts(job.cfg.warm_start, object_model.name)
         copied, left = warm_start(method, starts)
         said = "warm start from %s (%d files): %d tensors copied, %d left as drawn"
@@ -274,7 +274,8 @@ def say_stopped(run: Run) -> None:
     job, step = run.job, run.trainer.global_step
     sentence, again = f"stopped at step {step}", None
     if (job.folder / "checkpoints" / LAST).is_file():
-        again = typed("train", resume=job.folder, **places(job), **plugins(job))
+        words = list_unkept(job.overrides, job.folder)
+        again = " ".join([typed("train", resume=job.folder, **plugins(job)), *words])
         if job.swept:
             again = f"the same command with out={job.folder.parent}"
         sentence += f"; resume with: {again}"
