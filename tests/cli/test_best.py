@@ -225,6 +225,9 @@ def test_a_training_that_ends_before_its_first_validation_is_refused(
             check_validated(run)
 
 
+EVERY_SECOND = {"check_val_every_n_epoch": 2, "val_check_interval": 1.0}
+
+
 @pytest.mark.parametrize(
     ("changed", "told"),
     [
@@ -235,6 +238,8 @@ def test_a_training_that_ends_before_its_first_validation_is_refused(
         ({"max_epochs": 3, "limit_train_batches": 2}, "trainer.max_epochs=3: 6 batches"),
         ({"max_epochs": 5, "limit_train_batches": 0.5}, None),
         ({"max_epochs": 1, "check_val_every_n_epoch": 1, "val_check_interval": 1.0}, None),
+        ({**EVERY_SECOND, "max_steps": 7}, "trainer.check_val_every_n_epoch=2: an epoch has 4"),
+        ({**EVERY_SECOND, "max_steps": 7, "limit_train_batches": 3}, None),
     ],
 )
 def test_a_training_without_a_validation_is_refused_before_it_begins(

@@ -9,9 +9,10 @@ import torch
 from omegaconf import OmegaConf
 from tests.smoke.conftest import HOME, SMALL_POSE_PF, TINY
 
-from posefilter.cli import run_command
+from posefilter.cli import reuse, run_command
 from posefilter.cli.folders import note_failure
 from posefilter.cli.job import Job
+from posefilter.errors import UserError
 
 
 @pytest.mark.slow
@@ -79,3 +80,25 @@ def test_a_job_whose_results_are_damaged_counts_as_failed(tmp_path: Path) -> Non
     assert json.loads((tmp_path / "failed.json").read_text())["error"] == "damaged"
     (tmp_path / "metrics.json").write_text('{"iou": 1}')
     assert not note_failure(job, "another")
+
+
+def test_a_job_that_was_cut_short_with_other_settings_is_not_gone_on_with(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its folder is named by what was typed, which says neither `debug=` nor a changed default."""
+    settings = {"model": {"net": {"width": 8}}, "seed": 1}
+    then = {"choices": {"loss": "bce"}, "settings": settings}
+    now = {"choices": {"loss": "bce"}, "settings": {**settings, "model": {"net": {"width": 64}}}}
+    written = {"recipe": then, "global_step": 3}
+    (tmp_path / "checkpoints").mkdir()
+    (tmp_path / "checkpoints" / "last.ckpt").touch()
+    monkeypatch.setattr(reuse, "read_checkpoint", lambda file: written)
+    cfg = OmegaConf.create({"resume": None, "console": "json"})
+    job = Job(cfg, {}, ["seed=1"], tmp_path, "train", True)
+    monkeypatch.setattr(reuse, "recipe", lambda job: then)
+    assert reuse.start_from(job) == (tmp_path / "checkpoints" / "last.ckpt", 3)
+    monkeypatch.setattr(reuse, "recipe", lambda job: now)
+    with pytest.raises(UserError, match=r"cut short, .* than now \(model.net.width\); delete it"):
+        reuse.start_from(job)
+    cfg.resume = str(tmp_path)  # what may change is checked where it is typed
+    assert reuse.start_from(job)[1] == 3

@@ -103,19 +103,29 @@ def start_from(job: Job) -> tuple[Path | None, int]:
     its step; (None, 0) where the training starts anew.
 
     Where the last checkpoint is broken it is the one before, and the console says so.
+
+    Raises:
+        UserError: No checkpoint is whole, or a sweep's job was begun with other settings.
     """
     source = find_begun(job)
     if source is None:
         return None, 0
     last, *before = last_checkpoints(str(source))  # a folder's name may read as a number
     try:
-        return last, step_of(last)
+        checkpoint = read_checkpoint(last)
     except UserError as error:
         if not before:
             raise
         sentence = f"{error}; going on from {before[0]}"
         say(job.cfg.console, "fallback", sentence, broken=last, checkpoint=before[0])
-        return before[0], step_of(before[0])
+        last, checkpoint = before[0], read_checkpoint(before[0])
+    changed = [] if job.cfg.resume else differing(checkpoint["recipe"], recipe(job))
+    if changed:
+        raise UserError(
+            f"{job.folder}: holds a run that was cut short, with other settings than now "
+            f"({', '.join(changed[:5])}); delete it, or choose another out="
+        )
+    return last, int(checkpoint["global_step"])
 
 
 def find_begun(job: Job) -> Any:

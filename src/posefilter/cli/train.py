@@ -159,7 +159,9 @@ def check_validated(run: Run) -> None:
                 f"trainer.{name}=0: a training needs its validations, which choose the best "
                 "checkpoint"
             )
+    limit = trainer.limit_train_batches
     batches = len(run.data.train_dataloader())
+    batches = min(batches, limit) if isinstance(limit, int) else int(limit * batches)
     _check_epochs(trainer, batches)
     if every is None or trainer.max_steps < 0:
         return
@@ -176,8 +178,6 @@ def check_validated(run: Run) -> None:
 def _check_epochs(trainer: Trainer, batches: int) -> None:
     """Refuse epochs that end before the first validation, which counts batches."""
     epochs, interval = trainer.max_epochs, trainer.val_check_interval
-    limit = trainer.limit_train_batches
-    batches = min(batches, limit) if isinstance(limit, int) else int(limit * batches)
     by_batches = trainer.check_val_every_n_epoch is None and isinstance(interval, int)
     if by_batches and epochs is not None and 0 <= epochs * batches < interval:
         raise UserError(
