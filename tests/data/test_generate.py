@@ -309,11 +309,28 @@ def test_meshes_in_millimeters_take_a_scale_and_a_failed_start_blocks_nothing(
         assert (scaled == plain).mean() > 0.99
 
 
+def test_a_dataset_is_not_gone_on_with_once_its_mesh_has_changed(tmp_path: Path) -> None:
+    meshes, out = write_meshes(tmp_path / "meshes"), tmp_path / "out"
+    how = {"meshes": meshes, "object": "box0", "distractors": (0, 1), "progress": False}
+    how |= {"size": (96, 72), "workers": 1}
+    assert generate(out, 2, **how).rendered == 2
+    before = (meshes / "box0.ply").read_bytes()
+    trimesh.creation.box([0.1, 0.12, 0.2]).export(meshes / "box0.ply")
+    record = (out / "_generator.json").read_bytes()
+    with pytest.raises(UserError, match="another mesh of box0, whose file was changed since"):
+        generate(out, 3, **how)
+    assert (out / "_generator.json").read_bytes() == record
+    assert generate(out, 2, **how).rendered == 0  # nothing is left to render
+    assert (out / "_generator.json").read_bytes() == record
+    (meshes / "box0.ply").write_bytes(before)
+    assert generate(out, 3, **how).rendered == 1
+
+
 def test_a_record_from_before_meshes_had_a_scale_goes_on(alone: Path, tmp_path: Path) -> None:
     out = tmp_path / "copy"
     shutil.copytree(alone, out)
     record = json.loads((out / "_generator.json").read_text())
-    del record["settings"]["mesh_scale"]
+    del record["settings"]["mesh_scale"], record["mesh"]
     (out / "_generator.json").write_text(json.dumps(record))
     assert generate(out, 7, **SETTINGS).rendered == 0
 

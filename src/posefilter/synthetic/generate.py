@@ -10,6 +10,7 @@ import shutil
 import time
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
+from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,7 @@ import numpy as np
 from posefilter.errors import UserError
 from posefilter.files import remove_parts
 from posefilter.locks import LOCK, hold, release
+from posefilter.meshes.mesh import Mesh
 from posefilter.meshes.parts import split_part
 from posefilter.meshes.store import BUILTIN, MeshStore
 from posefilter.ranges import check_ranges
@@ -185,7 +187,7 @@ def generate(
     try:
         if held:  # another process may have rendered meanwhile
             todo = [i for i in todo if not all(path.is_file() for path in job.files(out, i))]
-        _open_dataset(out, job, frames)
+        _open_dataset(out, job, frames, digest_mesh(store.load(object)) if todo else None)
         if todo:
             log.info("rendering %d frames of %s into %s", len(todo), object, out)
         began = time.perf_counter()
@@ -280,14 +282,34 @@ def check_meshes(job: Job, store: MeshStore, frames: Sequence[int]) -> None:
             store.load(name)
 
 
-def _open_dataset(out: Path, job: Job, frames: int) -> None:
-    """Write the settings into a new dataset, or check that an existing one has the same."""
+def digest_mesh(mesh: Mesh) -> str:
+    """Return what differs between meshes of another shape, frame, texture mapping or texture size.
+
+    The texture's pixels are left out: what a JPEG is read as depends on the library.
+    """
+    arrays = (mesh.vertices, mesh.faces, mesh.corner_uv, mesh.corner_colors)
+    digest = sha256(str(mesh.texture.shape).encode())
+    for array in arrays:
+        digest.update(b"" if array is None else np.ascontiguousarray(array).tobytes())
+    return digest.hexdigest()
+
+
+def _open_dataset(out: Path, job: Job, frames: int, mesh: str | None) -> None:
+    """Write the settings into a new dataset, or check that an existing one has the same.
+
+    Args:
+        out: The dataset's folder.
+        job: What to render.
+        frames: How many frames it is to hold.
+        mesh: Digest of the object's mesh; None where nothing is left to render.
+    """
     settings = json.loads(json.dumps({"version": VERSION, **asdict(job)}))
     path = out / GENERATOR
     if path.is_file():
         try:
             record = json.loads(path.read_bytes())
             there, before = _with_defaults(record["settings"]), int(record["frames"])
+            known = record.get("mesh")
         except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
             raise UserError(
                 f"{path}: not a generator's record any more ({error}); choose another out="
@@ -302,8 +324,13 @@ def _open_dataset(out: Path, job: Job, frames: int) -> None:
             raise UserError(
                 f"{path}: this dataset was begun with other settings ({keys}); choose another out="
             )
+        elif mesh and known not in (None, mesh):
+            raise UserError(
+                f"{path}: this dataset was begun with another mesh of {job.object}, whose file was "
+                "changed since; choose another out="
+            )
         else:
-            frames = max(frames, before)
+            frames, mesh = max(frames, before), mesh or known
         remove_parts(out, [".", "mixed/*"])
     elif out.is_dir() and any(path.name != LOCK for path in out.iterdir()):
         raise UserError(
@@ -313,7 +340,8 @@ def _open_dataset(out: Path, job: Job, frames: int) -> None:
     out.mkdir(parents=True, exist_ok=True)
     packages = ("posefilter", "numpy", "embreex", "opencv-python-headless")
     versions = {name: _find_version(name) for name in packages}
-    fat.write_json(path, {"settings": settings, "frames": frames, "versions": versions})
+    record = {"settings": settings, "frames": frames, "mesh": mesh, "versions": versions}
+    fat.write_json(path, record)
 
 
 def _find_version(package: str) -> str | None:
