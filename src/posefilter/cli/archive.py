@@ -15,6 +15,7 @@ from torch.overrides import TorchFunctionMode
 
 from posefilter.cli.pickles import check_pickle
 from posefilter.errors import UserError
+from posefilter.geometry.pose import is_rigid
 from posefilter.paths import is_plain_name
 
 _LARGEST = 8 << 30  # bytes of a file
@@ -168,7 +169,7 @@ def _check_object(model: Any, said: str) -> None:
                 f"{said}: its object's {key} should have 1 to {most} rows of finite lengths [m]"
             )
     for key in held:
-        if key.endswith("symmetries") and not _are_rigid(held[key]):
+        if key.endswith("symmetries") and not is_rigid(held[key].double()):
             raise UserError(f"{said}: its object's {key} should be turns, each with a shift")
     colors = held["texture"][:, 6:] if "texture" in held else torch.zeros(1)
     if not bool(((colors >= 0) & (colors <= 1)).all()):
@@ -176,16 +177,6 @@ def _check_object(model: Any, said: str) -> None:
     for key in ("radius", "diameter"):
         if not (isinstance(model[key], float | int) and 0 < model[key] < 1000):
             raise UserError(f"{said}: its object's {key} should be a length [m]")
-
-
-def _are_rigid(symmetries: Tensor) -> bool:
-    R, last = symmetries[:, :3, :3].double(), symmetries[:, 3].double()
-    square = R @ R.transpose(1, 2)
-    return (
-        torch.allclose(square, torch.eye(3, dtype=R.dtype).expand_as(square), atol=1e-3)
-        and bool((torch.linalg.det(R) > 0).all())
-        and torch.equal(last, last.new_tensor([0.0, 0, 0, 1]).expand_as(last))
-    )
 
 
 def _leaves(node: Any, said: str) -> Iterator[Any]:

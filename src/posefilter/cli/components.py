@@ -41,16 +41,18 @@ def chosen(job: Job) -> dict[str, str]:
     }
 
 
-def changed(trained: dict[str, Any], wanted: dict[str, Any]) -> dict[str, Any]:
+def changed(old: dict[str, Any], new: dict[str, Any], where: str = "") -> dict[str, Any]:
     """Return a checkpoint's settings with some changed: a component that is chosen anew is
     replaced, any other section merged.
 
-    Raises UserError for settings that the trained method does not have.
+    Args:
+        old: What the method was trained with.
+        new: The settings to change.
+        where: The section that they are of.
+
+    Raises:
+        UserError: A setting that the trained method does not have.
     """
-    return _merge(trained, wanted, "")
-
-
-def _merge(old: dict[str, Any], new: dict[str, Any], where: str) -> dict[str, Any]:
     merged = dict(old)
     for key, value in new.items():
         place = f"{where}.{key}" if where else key
@@ -65,9 +67,9 @@ def _merge(old: dict[str, Any], new: dict[str, Any], where: str) -> dict[str, An
         here = merged[key]
         if isinstance(here, list) and isinstance(value, dict):  # `components.1.pixels=64`
             numbered = {str(number): one for number, one in enumerate(here)}
-            merged[key] = list(_merge(numbered, value, place).values())
+            merged[key] = list(changed(numbered, value, place).values())
         elif isinstance(here, dict) and isinstance(value, dict) and "_target_" not in value:
-            merged[key] = _merge(here, value, place)
+            merged[key] = changed(here, value, place)
         else:
             merged[key] = value
     return merged

@@ -1,5 +1,6 @@
 """Follow objects through videos: poses, figures, and an annotated video."""
 
+import math
 import re
 from collections.abc import Iterator, Sequence
 from contextlib import closing
@@ -291,8 +292,10 @@ def list_figures(figures: dict[str, Any]) -> list[tuple[str, str]]:
             ("ADD AUC", f"{figures['add']['auc']:.1f}"),
             ("ADD-S AUC", f"{figures['add_s']['auc']:.1f}"),
             ("false tracks", str(figures["false_tracks"])),
-            ("jitter", f"{figures['jitter_mm']:.1f} mm, {figures['jitter_deg']:.2f} degrees"),
         ]
+        if math.isfinite(figures["jitter_mm"]):  # two frames in a row were tracked
+            jitter = f"{figures['jitter_mm']:.1f} mm, {figures['jitter_deg']:.2f} degrees"
+            out.append(("jitter", jitter))
     if figures["frames_per_second"] is not None:
         out.append(("a frame", f"{1000 * figures['seconds_tracked']:.0f} ms"))
     return out

@@ -6,6 +6,7 @@ import numpy as np
 import torch
 
 from posefilter.errors import UserError
+from posefilter.geometry.pose import is_rigid
 from posefilter.geometry.rotation import exp_so3
 from posefilter.limits import read_json
 
@@ -109,11 +110,7 @@ def identity_first(symmetries: np.ndarray, source: str) -> np.ndarray:
     """
     if symmetries.ndim != 3 or symmetries.shape[1:] != (4, 4):
         raise UserError(f"{source}: symmetries must be of shape (S, 4, 4), not {symmetries.shape}")
-    R = symmetries[:, :3, :3]
-    if (
-        not np.allclose(R @ R.transpose(0, 2, 1), np.eye(3), atol=1e-3)
-        or (np.linalg.det(R) < 0).any()
-    ):
+    if not is_rigid(torch.from_numpy(symmetries)):
         raise UserError(
             f"{source}: a symmetry is not a rigid transform (rotation and translation, no mirror)"
         )

@@ -4,6 +4,7 @@ from typing import Any
 
 import torch
 from torch import Tensor
+from torchmetrics.functional.classification import binary_calibration_error
 
 from posefilter.metrics.collect import Rows, concat_state
 from posefilter.metrics.diagnostics import auroc
@@ -21,13 +22,8 @@ def calibration_error(probability: Tensor, correct: Tensor, bins: int = _BINS) -
 
     (M,), (M,) bool -> (); NaN without predictions.
     """
-    if not len(probability):
-        return torch.tensor(torch.nan)
-    bin = (probability * bins).long().clamp(0, bins - 1)
-    gap = torch.zeros(bins, dtype=torch.float64).index_add(
-        0, bin, probability.double() - correct.double()
-    )
-    return gap.abs().sum() / len(probability)
+    given = probability.double().contiguous()
+    return binary_calibration_error(given, correct.long(), n_bins=bins)
 
 
 def list_bins(probability: Tensor, correct: Tensor, bins: int = _BINS) -> list[dict[str, float]]:
