@@ -7,7 +7,7 @@ from tests.cli.conftest import Cold
 
 from posefilter.cli.command import register_resolvers, run_command
 from posefilter.cli.main import COMMANDS
-from posefilter.cli.usage import describe_command
+from posefilter.cli.usage import describe_command, list_groups
 
 CONF = Path(__file__).parents[2] / "conf"
 
@@ -37,6 +37,10 @@ def test_every_choice_of_a_training_is_listed() -> None:
             assert group in shown, group
             assert file.stem in shown, file
     assert "[pose_pf]" in describe_command("train", CONF)  # the default is marked
+    for listed in list_groups("train", [CONF]):
+        own = [file for file in files if file.parent == CONF / listed.name]
+        if not str(listed.choices[-1]).startswith("..."):  # too many to be listed
+            assert {file.stem for file in own} <= {*listed.choices}, listed.name
 
 
 def test_what_is_listed_is_what_is_typed() -> None:

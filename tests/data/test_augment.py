@@ -145,6 +145,21 @@ def test_an_occluder_is_in_front_and_leaves_enough() -> None:
     assert hidden > 5
 
 
+def test_an_occluder_of_a_deep_object_is_in_front_of_its_surface_and_of_what_is_beside() -> None:
+    x = sample()
+    near = x.depth.copy()
+    near[x.mask] = 0.75 * x.camera_from_object[2, 3]  # far before the object's origin
+    deep, hidden = dataclasses.replace(x, depth=near), 0
+    for seed in range(20):
+        out = PasteOccluder(1.0)(deep, lambda rng: deep, np.random.default_rng(seed))
+        lost = deep.mask & ~out.mask
+        hidden += bool(lost.any())
+        changed = (out.depth != deep.depth) & (deep.depth > 0)
+        assert (out.depth[lost] < deep.depth[lost]).all()
+        assert (out.depth[changed] < deep.depth[changed]).all()
+    assert hidden > 5
+
+
 def test_an_occluder_of_an_image_of_another_size_fits() -> None:
     x = sample()
     small = dataclasses.replace(x, rgb=x.rgb[::2, ::3].copy())

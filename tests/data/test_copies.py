@@ -57,6 +57,8 @@ def test_one_instance_is_what_it_was(scenes: Path, tmp_path: Path) -> None:
 def test_absent_means_all_of_them(tmp_path: Path) -> None:
     out = tmp_path / "none"
     generate(out, 2, instances=2, absent_fraction=1.0, progress=False, **FEW)  # type: ignore[arg-type]
-    for file in out.glob("mixed/*/[0-9]*.json"):
+    files = list(out.glob("mixed/*/[0-9]*.json"))
+    assert len(files) == 2
+    for file in files:
         classes = {one["class"] for one in json.loads(file.read_text())["objects"]}
         assert "carton_16k" not in classes

@@ -23,9 +23,10 @@ from dataset_trees import (
 )
 from scipy.spatial.transform import Rotation
 
-from posefilter.data.frames import tight_box
+from posefilter.data.frames import NotShown, tight_box
+from posefilter.data.module import PoseDataModule
 from posefilter.data.readers.fat import FatReader
-from posefilter.errors import BadData, UserError
+from posefilter.errors import UserError
 from posefilter.meshes.store import MeshStore
 
 
@@ -187,8 +188,13 @@ def test_hidden_objects_are_left_out_and_counted(tmp_path):
     fat_frame(folder, 0, [("toy", 24, pose(position=(0, 0, 2.0))), ("other", 36, pose())])
     path = folder / "000000.left.json"
     path.write_text(path.read_text().replace("0.81", "0.0"))
-    with pytest.raises(BadData, match="listed, but not in the label"):
+    with pytest.raises(NotShown, match="listed, but not in the label"):
         FatReader(tmp_path, "toy").read(0)
+    fat_frame(folder, 1, [("toy", 24, pose()), ("other", 36, pose(position=(0, 0, 2.0)))])
+    data = PoseDataModule("fat", tmp_path, "toy", split={"test": 1.0}, progress=False)
+    data.setup("test")
+    assert [record.im_id for record in data.records("test")] == [1]
+    assert data.describe()["splits"]["test"]["left_out"] == {"listed, but not in the label": 1}
 
 
 def spoil_json(key):

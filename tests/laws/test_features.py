@@ -1,10 +1,13 @@
 """Witnesses count what they are named for."""
 
 import math
+from types import SimpleNamespace
+from typing import Any
 
+import pytest
 import torch
 
-from posefilter.confidence.features import measure_coordinates
+from posefilter.confidence.features import measure_coordinates, measure_depth
 from posefilter.geometry.pose import make_pose, transform
 from posefilter.geometry.rotation import exp_so3
 from posefilter.nets.coordinates import Cells, Coordinates
@@ -63,3 +66,16 @@ def test_what_lies_beside_the_pose_speaks_against_it_where_it_should() -> None:
 def test_cells_that_the_network_does_not_recognize_are_told_by_their_share() -> None:
     assert abs(look(0.05, 0.3)["mask_recall"] - 0.3) < 0.01
     assert abs(look(0.05, 0.3)["top_objectness"] - 0.3) < 0.01
+
+
+@pytest.mark.parametrize(("wall", "free"), [(0.5, 0.5), (1.6, 1 / 202), (0.0, 0.5)])
+def test_what_is_seen_through_speaks_against_a_pose_and_what_hides_it_says_nothing(
+    wall: float, free: float
+) -> None:
+    K = torch.tensor([[100.0, 0, 31.5], [0, 100.0, 23.5], [0, 0, 1]])
+    pose = torch.eye(4)[None].clone()
+    pose[0, 2, 3] = 1.0
+    seen: Any = SimpleNamespace(depth=torch.full((1, 1, 48, 64), wall), intrinsics=K[None])
+    found = measure_depth(pose, seen, MODEL)
+    assert float(found["surface"]) == 0
+    assert float(found["free_space"]) == pytest.approx(free, abs=1e-3)

@@ -76,7 +76,8 @@ class ToyFilter:
 
     def __call__(self, batch: Batch, method: Any, generator: Generator) -> Trace:
         self.runs += 1
-        red = method.encode(batch)[:, 0] * (batch.depth[:, 0] > 0)
+        seen = method.encode(batch)
+        red = getattr(seen, "rgb", seen)[:, 0] * (batch.depth[:, 0] > 0)
         if self.draws:  # any of the squares
             noise = torch.rand(red.shape, generator=generator)
             red = (red > 0.5) * noise
@@ -226,6 +227,20 @@ def test_where_the_network_sees_nothing_there_is_nothing_to_find() -> None:
     assert measure_worth(SimpleNamespace(objectness=sure)) == pytest.approx(0.9)
     assert measure_worth(SimpleNamespace(objectness=blind)) == 0
     assert measure_worth(torch.zeros(1)) == 1
+
+
+class BlindToy(Toy):
+    """Its network is sure of nothing."""
+
+    def encode(self, batch: Batch) -> Any:
+        return SimpleNamespace(rgb=batch.rgb, objectness=torch.zeros(len(batch.rgb), 1, 6, 8))
+
+
+def test_no_further_search_is_made_where_the_network_sees_nothing() -> None:
+    toy = BlindToy()
+    _, last = run(toy, draw([[WRONG, RIGHT]]))
+    assert places(last) == [(5, 5)]
+    assert toy.filter.runs == 1
 
 
 def test_an_answer_that_is_hardly_better_does_not_replace_the_first() -> None:

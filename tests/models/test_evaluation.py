@@ -2,6 +2,8 @@
 gives no pose, and a box.
 """
 
+from itertools import product
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -72,6 +74,44 @@ def test_a_score_of_the_truth_sees_no_truth_either(monkeypatch: pytest.MonkeyPat
         method.validation_step(scenes(2), 0)
     assert len(seen) == 2
     assert not any(bool(batch.mask.any()) for batch in seen)
+    nothing = torch.eye(4).expand(2, 4, 4)
+    assert all(torch.equal(batch.camera_from_object, nothing) for batch in seen)
+
+
+def test_the_truth_is_outscored_where_the_estimate_scores_higher(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    method, batch = working().eval(), scenes(4)
+    with torch.no_grad():
+        trace = method.predict_step(batch, 0)
+    best = batch.camera_from_object.clone()
+    best[1:3, 0, 3] += 1.0  # wrong
+    trace = trace._replace(belief=trace.belief._replace(best=best))
+    scores = torch.tensor([[1.0, 0], [1, 0], [0, 1], [0, 1]])  # of the estimate and of the truth
+    monkeypatch.setattr(type(method), "_score", lambda *_: scores)
+    method.update_metrics(trace, batch)
+    found = method.compute_metrics()["belief"]
+    assert found["truth_outscored"] == 0.5
+    assert found["truth_outscored_by_wrong"] == 0.25
+    assert found["truth_outscored_by_misplaced"] == 0.25
+
+
+def test_draws_are_of_seed_stage_epoch_and_number_and_in_training_of_the_process() -> None:
+    method = working()
+
+    def first(
+        stage: str, number: int, rank: int = 0, processes: int = 1, epoch: int = 0, seed: int = 0
+    ) -> int:
+        method.seed = seed
+        method.__dict__["_trainer"] = SimpleNamespace(world_size=processes, global_rank=rank)
+        method.__dict__["current_epoch"] = epoch
+        return method.generator(stage, number).initial_seed()
+
+    train = {first("train", n, r, 2, e, s) for n, r, e, s in product((0, 1), repeat=4)}
+    assert len(train) == 16
+    assert len({first(s, 0) for s in ("train", "validate", "test", "predict")}) == 4
+    for stage in ("validate", "test", "predict"):
+        assert first(stage, 3, 1, 2, 5) == first(stage, 3)
 
 
 def test_a_method_without_pose_and_box_is_refused() -> None:

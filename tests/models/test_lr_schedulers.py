@@ -79,6 +79,16 @@ def test_the_projects_own_takes_the_trainings_steps() -> None:
     ]
 
 
+def test_a_warm_up_is_linear_and_the_decay_a_cosine_to_the_last_rate() -> None:
+    optimizer = torch.optim.SGD([torch.zeros(1, requires_grad=True)], lr=RATE)
+    factor = warmup_cosine(optimizer, 40, 200, 0.02).lr_lambdas[0]  # at most a tenth of the steps
+    assert [factor(i) for i in range(4)] == [0.25, 0.5, 0.75, 1.0]
+    wanted = [1.0, 0.02 + 0.49 * (1 + 0.5**0.5), 0.51, 0.02, 0.02]
+    assert [factor(i) for i in (4, 13, 22, 40, 99)] == pytest.approx(wanted)
+    short = warmup_cosine(optimizer, 40, 2).lr_lambdas[0]
+    assert [short(i) for i in (0, 1, 2, 40)] == pytest.approx([0.5, 1.0, 1.0, 0.01])
+
+
 MISTAKES = {
     ("ExponentialLR", True): r"scheduler\.gamma: is missing, and has no default; the number of",
     ("StepLR", True): r"scheduler\.step_size: is missing",
