@@ -87,6 +87,7 @@ RANGES: dict[str, Range] = {
     "limit_val": COUNT,
     "limit_test": COUNT,
     "data.num_model_points": _whole(4, 1_000_000),
+    "data.texture_points": _whole(4, 20_000),
     "image_width": _whole(16, MOST_SIDE),
     "image_height": _whole(16, MOST_SIDE),
     # data.augment: the rest is checked by its classes
@@ -262,6 +263,10 @@ RANGES: dict[str, Range] = {
     "refine.noise": METERS,
     "refine.effective": POSITIVE,
     "refine.points": COUNT,
+    "refine.initial_blur": Range(1, 100),
+    "refine.independent": POSITIVE,
+    "refine.min_correlation": SHARE,
+    "refine.gate": METERS,
     # model
     "model.pixels": COUNT,
     "train_pixels": COUNT,

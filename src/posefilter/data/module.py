@@ -25,7 +25,7 @@ from posefilter.data.readers.registry import open_meshes, open_reader
 from posefilter.data.splits import NAMES, Share, split_records
 from posefilter.errors import UserError
 from posefilter.meshes.store import BUILTIN, MeshStore, object_model
-from posefilter.meshes.texture import add_texture
+from posefilter.meshes.texture import TEXTURE_POINTS, add_texture
 from posefilter.ranges import check_ranges
 from posefilter.types import Batch, ObjectModel
 
@@ -71,6 +71,7 @@ class PoseDataModule(LightningDataModule):
         limit_val: int | None = None,
         limit_test: int | None = None,
         num_model_points: int = 2000,
+        texture_points: int = TEXTURE_POINTS,
         model_points_dir: str | Path | None = None,
         generate: Callable[[Path], Any] | None = None,
         options: Mapping[str, Any] | None = None,
@@ -102,6 +103,7 @@ class PoseDataModule(LightningDataModule):
             limit_val: Likewise of val.
             limit_test: Likewise of test.
             num_model_points: Surface points for ADD.
+            texture_points: Colored surface points that a method is given of the object it learns.
             model_points_dir: A folder with <class>/points.xyz in the dataset's own frame instead.
             generate: Called with the root where scenes are yet to be rendered.
             options: The reader's own.
@@ -133,6 +135,7 @@ class PoseDataModule(LightningDataModule):
         self._seed, self._augment, self._on_error = seed, augment, on_error
         self._cache_kind, self._cache_dir = cache, cache_dir
         self._num_model_points, self._model_points_dir = num_model_points, model_points_dir
+        self._texture_points = texture_points
         self._progress = progress
         self._datasets: dict[str, FrameDataset] = {}
         self._left_out: dict[str, Counter[str]] = {}
@@ -217,7 +220,8 @@ class PoseDataModule(LightningDataModule):
         Raises:
             UserError: As `object_model`.
         """
-        return add_texture(self.object_model(0), self.meshes.load(self.objects[0]))
+        mesh = self.meshes.load(self.objects[0])
+        return add_texture(self.object_model(0), mesh, self._texture_points)
 
     def records(self, split: str) -> list[FrameRecord]:
         """Return the records of a split: a batch's `frame_id` is an index into them."""

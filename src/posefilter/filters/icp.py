@@ -94,13 +94,9 @@ class PointToPlaneIcp:
         for index in range(self.iterations):
             part = index / max(self.iterations - 1, 1)
             width = self.initial_gate * (self.final_gate / self.initial_gate) ** part
-            rows, offsets, weights = self._pair(pose, own, center, encoding, width)
-            total = weights.sum(-1)
-            known = total > _FEW
-            share = (self.effective / total.clamp_min(_FEW)).clamp_max(1) / self.noise**2
-            weighted = rows.mT * (weights * share[:, None])[:, None]
-            slope = weighted @ offsets[..., None] - precision @ moved
-            step = torch.linalg.solve(weighted @ rows + precision, slope) * known[:, None, None]
+            information, slope, known = self.measure(pose, own, center, encoding, width)
+            slope = slope[..., None] - precision @ moved
+            step = torch.linalg.solve(information + precision, slope) * known[:, None, None]
             # for turns as small as these, twists add up
             pose, moved = space.move(pose, step[..., 0].to(pose)), moved + step
         # without enough points in the last step what was paired before was something else
@@ -109,6 +105,28 @@ class PointToPlaneIcp:
     def choose_points(self, points: Tensor) -> Tensor:
         """Return every so many of an object's surface points.  (P, 3) -> (`points` at most, 3)."""
         return points[:: -(-len(points) // self.points)]
+
+    def measure(
+        self, pose: Tensor, own: Tensor, center: Tensor, encoding: HasDepth, width: float
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Return what the depth says of a pose's twist.
+
+        Args:
+            pose: (B, 4, 4) camera_from_object [m].
+            own: (P, 3) surface points [m].
+            center: (3,) the object's center [m].
+            encoding: Depth and camera.
+            width: Of the loss [m].
+
+        Returns:
+            The normal equations of a Gauss-Newton step: matrices (B, 6, 6) and right sides (B, 6),
+            in float64; and whether enough points were paired, (B,).
+        """
+        rows, offsets, weights = self._pair(pose, own, center, encoding, width)
+        total = weights.sum(-1)
+        share = (self.effective / total.clamp_min(_FEW)).clamp_max(1) / self.noise**2
+        weighted = rows.mT * (weights * share[:, None])[:, None]
+        return weighted @ rows, (weighted @ offsets[..., None])[..., 0], total > _FEW
 
     def _pair(
         self, pose: Tensor, own: Tensor, center: Tensor, encoding: HasDepth, width: float

@@ -21,8 +21,8 @@ from posefilter.geometry.spaces import PoseSpace
 from posefilter.protocols import Encoding, HasColor, Method, ScoresPoses
 from posefilter.types import BeliefBatch, ObjectModel
 
-_DARK = 0.03  # added to colors before the logarithm, so that black does not decide
-_GRAZING = 0.25  # cosine of the angle between a surface and the way to the camera
+DARK = 0.03  # added to colors before the logarithm, so that black does not decide
+GRAZING = 0.25  # cosine of the angle between a surface and the way to the camera
 _NEAR = (0.004, 0.03)  # [m, diameters] between a point and what is measured at its pixel
 _BLUR = 0.33  # of the distance between neighboring points
 _SHARPEST = 0.5  # [px]
@@ -91,7 +91,7 @@ def read_print(object_model: ObjectModel, like: Tensor | None = None) -> Print:
     texture = object_model.texture.float() if like is None else object_model.texture.to(like)
     # by a sphere's area: a cylinder's or a box's differs by less than matters for a blur
     spacing = object_model.radius * (4 * torch.pi / 3 / len(texture)) ** 0.5
-    return Print(texture[:, :3], texture[:, 3:6], (texture[:, 6:] + _DARK).log(), spacing)
+    return Print(texture[:, :3], texture[:, 3:6], (texture[:, 6:] + DARK).log(), spacing)
 
 
 def _compare(
@@ -110,8 +110,7 @@ def _compare(
     pixels = project(points, K)
     at = nearest_pixel(pixels).flatten(0, 1)
     z = gather_pixels(depth[None, None], at[None])[0, :, 0].unflatten(0, cosine.shape)
-    near = (z - points[..., 2]).abs() < _NEAR[0] + _NEAR[1] * object_model.diameter
-    seen = (z > 0) & near & (cosine > _GRAZING)
+    seen = near_surface(z, points[..., 2], object_model) & (cosine > GRAZING)
     weights = seen * cosine
     focal = float(K[0, 0])
     covered = (weights * (own.spacing * focal / points[..., 2].clamp_min(0.05)).square()).sum(-1)
@@ -119,19 +118,36 @@ def _compare(
     basis = torch.cat([torch.ones_like(cosine)[..., None], normals], dim=-1)
     if not bool(seen.any()):
         return torch.zeros_like(count)
-    x = _remove(own.color.expand_as(points), basis, weights)
+    x = remove_linear(own.color.expand_as(points), basis, weights)
     middle = float(origin_of(poses, object_model.center.to(poses))[:, 2].median().clamp_min(0.05))
-    sigma, step = max(_SHARPEST, _BLUR * own.spacing * focal / middle), shift * focal
-    image, corner = _blur_around(color, pixels[seen], sigma, step)
+    sigma, step = choose_blur(own, focal, middle), shift * focal
+    image, corner = blur_around(color, pixels[seen], sigma, step)
     offsets = torch.cartesian_prod(*2 * [pixels.new_tensor([-step, 0, step] if step else [0])])
     moved = (pixels - corner)[:, :, None] + offsets.reshape(-1, 2)  # (C, P, S, 2)
-    y = sample((image + _DARK).log()[None], moved.flatten(0, 2)[None])[0]
-    y = _remove(y.reshape(*cosine.shape, -1), basis, weights).unflatten(-1, (-1, 3))
+    y = sample((image + DARK).log()[None], moved.flatten(0, 2)[None])[0]
+    y = remove_linear(y.reshape(*cosine.shape, -1), basis, weights).unflatten(-1, (-1, 3))
     best = _correlate(x[:, :, None], y, weights).amax(1).clamp_min(0)
     return -0.5 * count * torch.log1p(-best.clamp_max(_LARGEST).square())
 
 
-def _blur_around(
+def near_surface(measured: Tensor, depth: Tensor, object_model: ObjectModel) -> Tensor:
+    """Return whether points are what is measured at their pixels, by their depths [m]."""
+    near = (measured - depth).abs() < _NEAR[0] + _NEAR[1] * object_model.diameter
+    return (measured > 0) & near
+
+
+def choose_blur(own: Print, focal: float, distance: float) -> float:
+    """Return the blur that an image needs to be compared with textured points [px].
+
+    Args:
+        own: The points.
+        focal: Focal length [px].
+        distance: Of the object [m].
+    """
+    return max(_SHARPEST, _BLUR * own.spacing * focal / distance)
+
+
+def blur_around(
     image: Tensor, pixels: Tensor, sigma: float, margin: float
 ) -> tuple[Tensor, Tensor]:
     """Return the part of a blurred image that some pixels are in, since the rest costs time.
@@ -166,7 +182,7 @@ def _correlate(x: Tensor, y: Tensor, weights: Tensor) -> Tensor:
     return xy / (xx * yy).sqrt().clamp_min(1e-9)
 
 
-def _remove(values: Tensor, basis: Tensor, weights: Tensor) -> Tensor:
+def remove_linear(values: Tensor, basis: Tensor, weights: Tensor) -> Tensor:
     """Return what a weighted regression on a basis leaves.  (C, P, V), (C, P, 4), (C, P)."""
     # of a plane, or of two, normals are linearly dependent but for the ridge: too much for float32
     exact, weighted = basis.double(), (basis * weights[..., None]).double()

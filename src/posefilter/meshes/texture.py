@@ -12,25 +12,25 @@ from posefilter.meshes.mesh import Mesh, sample_surface, surface_colors, surface
 from posefilter.meshes.rotational_symmetries import ANY, make_group, select
 from posefilter.types import ObjectModel
 
-_POINTS = 800
+TEXTURE_POINTS = 800
 _SAMPLES = 20  # of the texture, averaged at each of them
 _SIDE = 0.05  # of the extent: how far apart the two sides of a thin wall count
 _STEPS = 144  # of a turn by any angle: 2.5 degrees
 _COARSE_STEPS = 24  # where two axes leave any angle open
 
 
-def add_texture(object_model: ObjectModel, mesh: Mesh) -> ObjectModel:
-    """Return the object with its textured points and its shape's symmetries.
+def add_texture(object_model: ObjectModel, mesh: Mesh, count: int = TEXTURE_POINTS) -> ObjectModel:
+    """Return the object with `count` textured points and its shape's symmetries.
 
     A mesh whose shape cannot be examined, such as a flat one, has no symmetries but the identity.
     """
     return object_model._replace(
-        texture=torch.from_numpy(sample_texture(mesh)),
+        texture=torch.from_numpy(sample_texture(mesh, count)),
         shape_symmetries=torch.from_numpy(find_shape_symmetries(mesh, object_model.diameter)),
     )
 
 
-def sample_texture(mesh: Mesh, count: int = _POINTS, seed: int = 0) -> np.ndarray:
+def sample_texture(mesh: Mesh, count: int = TEXTURE_POINTS, seed: int = 0) -> np.ndarray:
     """Draw surface points with the mean color of the surface around each.
 
     Args:
