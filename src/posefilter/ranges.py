@@ -266,6 +266,8 @@ RANGES: dict[str, Range] = {
     "refine.initial_blur": Range(1, 100),
     "refine.independent": POSITIVE,
     "refine.min_correlation": SHARE,
+    "refine.texture_error": METERS,
+    "refine.min_gain": WEIGHT,
     "refine.gate": METERS,
     # model
     "model.pixels": COUNT,

@@ -9,7 +9,8 @@ from torch import Generator, Tensor
 
 from posefilter.errors import UserError
 from posefilter.filters.icp import PointToPlaneIcp
-from posefilter.filters.texture_alignment import TextureAlignment, pixel_derivatives
+from posefilter.filters.texture import measure_texture
+from posefilter.filters.texture_alignment import TextureAlignment, find_sides, pixel_derivatives
 from posefilter.geometry.camera import project
 from posefilter.geometry.pose import make_pose, transform
 from posefilter.geometry.rotation import random_rotation
@@ -17,6 +18,8 @@ from posefilter.geometry.spaces import PoseSpace
 from posefilter.rendering.surfaces import Lights
 from posefilter.types import BeliefBatch, ObjectModel
 from printed_objects import K, Seen, load, look
+
+EXACT = TextureAlignment(texture_error=1e-4, min_gain=0.0)  # of a texture that is where it should
 
 
 def draw(name: str, count: int) -> list[Tensor]:
@@ -88,7 +91,7 @@ def test_exposure_white_balance_and_light_hardly_matter() -> None:
     tint = torch.tensor([0.9, 0.6, 0.5])[:, None, None]
     tinted = seen._replace(measured_color=seen.measured_color * tint)
     lit = look("carton", pose, Lights(0.3, ((-0.6, 0.2, -0.8),), (0.8,)))
-    plain, *others = (align(start, one, model) for one in (seen, tinted, lit))
+    plain, *others = (align(start, one, model, EXACT) for one in (seen, tinted, lit))
     assert float(off(plain, pose[None], model)) < 1.5
     assert all(float(off(one, plain, model)) < 0.8 for one in others)
 
@@ -97,10 +100,39 @@ def test_colors_beside_the_depth_draw_it_along() -> None:
     model, pose = load("carton"), draw("carton", 1)[0]
     seen = look("carton", pose)
     moved = seen._replace(measured_color=seen.measured_color.roll(2, dims=-1))  # to the right
-    shift = (align(pose[None], moved, model)[0] - pose)[:3, 3]
+    shift = (align(pose[None], moved, model, EXACT)[0] - pose)[:3, 3]
     one_pixel = float(pose[2, 3] / K[0, 0])
     assert 1.2 * one_pixel < shift[0] < 2.3 * one_pixel
     assert abs(shift[1]) < 0.5 * one_pixel
+
+
+def test_an_estimate_is_moved_where_the_evidence_rises_clearly() -> None:
+    model, pose = load("carton"), draw("carton", 1)[0]
+    start, seen = displace(pose, model, 1)[None], look("carton", pose)
+    moved = align(start, seen, model, EXACT)
+    before, after = measure_texture(torch.stack([start, moved], dim=1), seen, model, shift=0)[0]
+    rise = float(after - before)
+    assert rise > 5
+    for least, found in ((rise - 0.1, moved), (rise + 0.1, start)):
+        refine = TextureAlignment(texture_error=1e-4, min_gain=least)
+        assert torch.equal(align(start, seen, model, refine), found)
+
+
+def test_a_side_whose_texture_was_scanned_beside_its_place_turns_nothing() -> None:
+    """The depth tells the turn; a rigid print would have to turn to be on both sides' prints."""
+    model, seen_turns = load("carton"), {1e-4: 0.0, 0.003: 0.0}
+    assert model.texture is not None
+    side = find_sides(model.texture[:, 3:6]) == 0
+    texture = model.texture.clone()
+    tangent = torch.linalg.cross(texture[side][:1, 3:6], torch.tensor([[0.6, 0.0, 0.8]]))
+    texture[side, :3] += 0.004 * torch.nn.functional.normalize(tangent, dim=-1)
+    for pose in draw("carton", 8):
+        seen = look("carton", pose)
+        for error in seen_turns:
+            refine = TextureAlignment(texture_error=error, min_gain=0.0)
+            found = align(pose[None], seen, model._replace(texture=texture), refine)
+            seen_turns[error] += float(off(found, pose[None], model))
+    assert seen_turns[0.003] < 0.8 * seen_turns[1e-4]
 
 
 def test_what_hides_a_part_has_no_say() -> None:
@@ -109,7 +141,7 @@ def test_what_hides_a_part_has_no_say() -> None:
     color, depth = seen.measured_color.clone(), seen.measured_depth.clone()
     color[..., 60:, :] = torch.rand(color[..., 60:, :].shape, generator=Generator().manual_seed(1))
     depth[..., 60:, :] = 0.5 * float(pose[2, 3])  # a wall before the lower half
-    found = align(start, Seen(color, depth, seen.intrinsics), model)
+    found = align(start, Seen(color, depth, seen.intrinsics), model, EXACT)
     assert float(off(found, pose[None], model)) < 0.75 * float(off(start, pose[None], model))
 
 
@@ -145,7 +177,9 @@ def test_pixels_move_by_their_derivatives() -> None:
     [
         ({"iterations": 0}, "iterations and initial_blur of 1 or more"),
         ({"initial_blur": 0.5}, "iterations and initial_blur of 1 or more"),
-        ({"prior": 0.0}, "prior and independent above 0"),
+        ({"prior": 0.0}, "prior, independent and texture_error above 0"),
+        ({"texture_error": 0.0}, "prior, independent and texture_error above 0"),
+        ({"min_gain": -1.0}, "min_gain of 0 or more"),
         ({"min_correlation": 1.0}, "min_correlation=1.0: must lie between 0 and 1"),
         ({"gate": 0.0}, "ICP needs numbers above 0"),
     ],

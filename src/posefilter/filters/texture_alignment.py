@@ -34,6 +34,7 @@ _HALF = 0.5  # [px] on either side, between which the image's slope is taken
 _MOVES = 6.0  # [px] that a point may be moved by
 _PIXELS = 2.0  # that a point needs for itself
 _REWEIGHTED = 3  # times that the weights of points are adapted to the residuals
+_SIDES = 6  # of an object
 _OUTLIER = 2.0  # standard deviations of a residual that halve a point's weight
 _LEAST_NOISE = 0.01  # of the logarithm of colors
 
@@ -55,9 +56,10 @@ class TextureAlignment:
     The image is blurred less from step to step. Added are the terms of point-to-plane ICP, and the
     estimate before as a Gaussian prior.
 
-    The result is kept where the print explains the image better than before. An object that has no
-    print stays where it is. It supposes that color and depth are registered, and that the mesh's
-    texture lies where the object's does.
+    Scans have their texture a millimeter or two beside their shape, and otherwise on each side: the
+    print of each of six sides may be shifted, with a Gaussian prior. The estimate is moved only
+    where the print then explains the image clearly better; one of an object without a print stays.
+    Color and depth should be registered: where they are not, the result follows the colors.
 
     Args:
         iterations: Gauss-Newton steps.
@@ -65,6 +67,9 @@ class TextureAlignment:
         prior: Standard deviation of the estimate before [m on the object's surface].
         independent: Share of the textured points that count as independent.
         min_correlation: Of the object's colors with the image's; below, they are not used.
+        texture_error: Standard deviation of the shift of a side's print [m].
+        min_gain: By which the evidence of the print must rise for the estimate to be moved [nat],
+            see `measure_texture`.
         gate: Distance beyond which a measured point is not the surface point's [m].
         noise: Standard deviation of a measured distance along the normal [m].
         effective: Surface points count as this many independent ones at most.
@@ -83,16 +88,20 @@ class TextureAlignment:
         prior: float = 0.008,
         independent: float = 0.3,
         min_correlation: float = 0.5,
+        texture_error: float = 0.002,
+        min_gain: float = 10.0,
         gate: float = 0.006,
         noise: float = 0.004,
         effective: float = 240.0,
         points: int = 500,
     ) -> None:
-        if not (min(iterations, initial_blur) >= 1 and min(prior, independent) > 0):
+        least = min(prior, independent, texture_error)
+        if not (min(iterations, initial_blur) >= 1 and least > 0 and min_gain >= 0):
             raise UserError(
                 "refine: alignment of the texture needs iterations and initial_blur of 1 or more, "
-                f"prior and independent above 0; got {iterations}, {initial_blur}, {prior} and "
-                f"{independent}"
+                "min_gain of 0 or more, prior, independent and texture_error above 0; got "
+                f"{iterations}, {initial_blur}, {min_gain}, {prior}, {independent} and "
+                f"{texture_error}"
             )
         if not 0 < min_correlation < 1:
             raise UserError(f"refine: min_correlation={min_correlation}: must lie between 0 and 1")
@@ -100,6 +109,7 @@ class TextureAlignment:
             initial_gate=gate, final_gate=gate, noise=noise, effective=effective, points=points
         )
         self.iterations, self.initial_blur, self.prior = iterations, initial_blur, prior
+        self.texture_error, self.min_gain = texture_error, min_gain
         self.independent, self.min_correlation, self.gate = independent, min_correlation, gate
 
     @torch.no_grad()
@@ -134,7 +144,7 @@ class TextureAlignment:
             pose, moved = space.move(pose, step.to(pose)), moved + step
         both = torch.stack([first, pose], dim=1)
         fits = measure_texture(both, encoding, object_model, shift=0)
-        better = known & (fits[:, 1] > fits[:, 0])
+        better = known & (fits[:, 1] - fits[:, 0] > self.min_gain)
         return belief._replace(best=torch.where(better[:, None, None], pose, first))
 
     def _compare(
@@ -169,9 +179,14 @@ class TextureAlignment:
         correlation = (power * y).sum() / ((power * x).sum() * _square(y, weights)).sqrt()
         if not float(correlation) > self.min_correlation:
             return None
-        slopes = along @ pixel_derivatives(points, points - center, pose, K)  # (n, 3, 6)
+        by_twist = pixel_derivatives(points, points - center, pose, K)
+        sides = F.one_hot(find_sides(own.normals)[seen], _SIDES).to(pose)
+        # a shift of a side's print, in the object's axes
+        by_shift = by_twist[..., :3] @ rotation_of(pose)
+        by_shift = (sides[:, None, :, None] * by_shift[:, :, None]).flatten(2)  # (n, 2, 3 sides)
+        slopes = along @ torch.cat([by_twist, by_shift], dim=-1)
         rows = remove_linear(slopes.flatten(1)[None], basis[None], weights[None])[0]
-        rows = rows.unflatten(1, (3, 6)).double()
+        rows = rows.unflatten(1, (3, -1)).double()
         # of what the gain explains as well nothing is told
         share = (power[..., None].double() * rows).sum((0, 1)) / (power * x).sum().double()
         rows = rows - x[..., None].double() * share
@@ -181,10 +196,13 @@ class TextureAlignment:
         count = min(len(x), covered / (_PIXELS * max(1.0, sigma**2)))
         scale = self.independent * count / len(x) / variance.clamp_min(_LEAST_NOISE**2)
         weighted = rows * weights[:, None, None].double()
-        return Term(
-            scale * torch.einsum("ncd,nce->de", weighted, rows),
-            -scale * torch.einsum("ncd,nc->d", weighted, residual),
-        )
+        information = scale * torch.einsum("ncd,nce->de", weighted, rows)
+        slope = -scale * torch.einsum("ncd,nc->d", weighted, residual)
+        # the shifts of the sides are eliminated
+        prior = torch.eye(3 * _SIDES, dtype=rows.dtype, device=rows.device) / self.texture_error**2
+        both = information[6:, :6]
+        part = torch.linalg.solve(information[6:, 6:] + prior, both).mT
+        return Term(information[:6, :6] - part @ both, slope[:6] - part @ slope[6:])
 
     def _fit(
         self, color: Tensor, seen: Tensor, basis: Tensor, weights: Tensor
@@ -206,6 +224,15 @@ class TextureAlignment:
             spread = (1.4826 * residual.abs().median()).clamp_min(_LEAST_NOISE)
             weights = plain / (1 + residual.square().mean(1) / (_OUTLIER * spread).square())
         return x, y, weights, gain
+
+
+def find_sides(normals: Tensor) -> Tensor:
+    """Return which of six sides of an object a point is on, by its normal: those of the axes that
+    the normals gather about.  (P, 3) -> (P,).
+    """
+    axes = torch.linalg.eigh(normals.mT @ normals).eigenvectors
+    along = normals @ axes
+    return torch.cat([along, -along], dim=1).argmax(1)
 
 
 class _Image(NamedTuple):
