@@ -8,7 +8,13 @@ import torch
 from torch import Generator, Tensor
 
 from posefilter.errors import UserError
-from posefilter.filters.texture import TextureRotations, blur, list_rotations, measure_texture
+from posefilter.filters.texture import (
+    TextureRotations,
+    blur,
+    coarsen_texture,
+    list_rotations,
+    measure_texture,
+)
 from posefilter.geometry.camera import project
 from posefilter.geometry.lookup import gather_pixels, nearest_pixel, sample
 from posefilter.geometry.pose import make_pose, transform
@@ -68,6 +74,21 @@ def test_the_right_turn_stays() -> None:
     out = turn(given, look("carton", pose), model)
     assert torch.allclose(out.best[0], pose, atol=1e-5)
     assert torch.allclose(out.poses, given.poses, atol=1e-5)
+
+
+def test_a_coarser_print_has_the_mean_colors_of_the_finer() -> None:
+    model = load("carton")
+    assert model.texture is not None
+    assert coarsen_texture(model, len(model.texture)) is model
+    coarse = coarsen_texture(model, 100).texture
+    assert coarse is not None
+    assert torch.equal(coarse[:, :6], model.texture[:100, :6])
+    gap = torch.cdist(model.texture[:, :3], coarse[:, :3])
+    gap[model.texture[:, 3:6] @ coarse[:, 3:6].T < 0.5] = torch.inf  # of the same face
+    own = gap.argmin(1) == 7
+    torch.testing.assert_close(coarse[7, 6:], model.texture[own, 6:].mean(0), atol=0.02, rtol=0)
+    mean = coarse[:, 6:].mean(0)
+    torch.testing.assert_close(mean, model.texture[:, 6:].mean(0), atol=0.03, rtol=0)
 
 
 def test_a_plain_object_says_nothing() -> None:

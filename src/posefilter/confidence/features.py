@@ -11,7 +11,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from posefilter.filters.texture import measure_texture
+from posefilter.filters.texture import coarsen_texture, measure_texture
 from posefilter.geometry.camera import project
 from posefilter.geometry.lookup import gather_pixels, nearest_pixel
 from posefilter.geometry.pose import invert, transform
@@ -95,7 +95,8 @@ def measure_print(best: Tensor, batch: Batch, object_model: ObjectModel) -> dict
     if object_model.texture is None:
         return {}
     image = _Image(batch.rgb, batch.depth[:, 0], batch.intrinsics)
-    return {"texture": measure_texture(best[:, None], image, object_model)[:, 0].log1p()}
+    evidence = measure_texture(best[:, None], image, coarsen_texture(object_model))[:, 0]
+    return {"texture": evidence.log1p()}
 
 
 def measure_coordinates(

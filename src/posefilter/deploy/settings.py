@@ -11,7 +11,12 @@ from posefilter.filters import estimate, initialize, propagate, refine, resample
 from posefilter.filters.agreement import Agreement
 from posefilter.filters.icp import PointToPlaneIcp
 from posefilter.filters.loop import ParticleFilter
-from posefilter.filters.texture import TextureRotations, list_rotations, read_print
+from posefilter.filters.texture import (
+    TextureRotations,
+    coarsen_texture,
+    list_rotations,
+    read_print,
+)
 from posefilter.models.base import PoseEstimator
 from posefilter.models.image_space import ImageSpace
 from posefilter.models.pose_pf import PosePF
@@ -178,7 +183,7 @@ def describe_rotations(one: TextureRotations, object_model: ObjectModel) -> list
     turns, coarse = list_rotations(object_model)
     if len(turns) == 1:
         return []
-    own = read_print(object_model)
+    own = read_print(coarsen_texture(object_model))
     surface = torch.cat([own.points, own.normals, own.color], dim=1)
     return [
         {
