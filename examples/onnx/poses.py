@@ -72,6 +72,9 @@ class PoseFilter:
             if step["kind"] == "texture":
                 best, poses = self.turn(encoding, image, best, poses, rng, **step)
                 continue
+            if step["kind"] == "texture_alignment":
+                best = self.align_print(image, best, **step)
+                continue
             refine = self.rescore if step["kind"] == "rescore" else self.shift
             best, score = refine(encoding, best, poses, weights, rng, **step)
         window = self.magnify(image, best[None], np.ones(1), **zoom) if zoom else None
@@ -169,6 +172,29 @@ class PoseFilter:
             pose, moved = move(pose[None], step[None], self.center)[0], moved + step
         return np.float32(pose) if known else best
 
+    def align_print(self, image, best, surface, spacing, sides, iterations, initial_blur, prior,
+                    gate, noise, effective, min_gain, **step):  # fmt: skip
+        """Move the estimate so that its print lies on the image's, and its surface on the depth."""
+        pose, known, moved = best.astype(float), False, np.zeros(6)
+        surface, own = np.array(surface), np.split(np.array(step["print"]), 3, axis=1)
+        precision = np.diag(self.scale(prior).astype(float) ** -2)
+        size = self.settings["diameter"]
+        for index in range(iterations):
+            rows, along, weights = pair(image, pose, surface, self.center, gate)
+            weights = weights * min(1, effective / max(weights.sum(), 10)) / noise**2
+            information, slope = (rows.T * weights) @ rows, rows.T @ (weights * along)
+            blurred = initial_blur ** (1 - (index + 1) / iterations)
+            told = read_print(image, pose, own, np.array(sides), self.center, spacing, size,
+                              blurred, **step)  # fmt: skip
+            known = told is not None
+            if known:
+                information, slope = information + told[0], slope + told[1]
+            twist = np.linalg.solve(information + precision, slope - precision @ moved)
+            pose, moved = move(pose[None], twist[None], self.center)[0], moved + twist
+        both = np.stack([best, np.float32(pose)])
+        fits = compare(image, both, own, self.center, spacing, size, True)
+        return both[1] if known and fits[1] - fits[0] > min_gain else best
+
     def turn(self, encoding, image, best, poses, rng, turns, coarse, surface, spacing,
              learned_weight, pixels, sigma, **_):  # fmt: skip
         """Turn the estimate and the particles as the object's print says."""
@@ -227,6 +253,64 @@ def compare(image, poses, own, center, spacing, size, still):
         xy, xx, yy = ((weight[..., None] * one).sum((1, 2)) for one in (x * y, x * x, y * y))
         best = np.maximum(best, xy / np.sqrt(xx * yy).clip(1e-9))
     return -0.5 * count * np.log1p(-(best.clip(0, 0.99) ** 2))
+
+
+def read_print(image, pose, own, sides, center, spacing, size, blurred, independent,
+               min_correlation, texture_error, **_):  # fmt: skip
+    """What the colors say of a pose's move: a matrix (6, 6) and a right side (6,), or nothing.
+
+    A Gauss-Newton step of y = shading + gain x, with the print of each side shifted a little.
+    """
+    K, depth, R = image["intrinsics"].astype(float), image["depth"], pose[:3, :3]
+    points, normals = own[0] @ R.T + pose[:3, 3], own[1] @ R.T
+    cosine = -(normals * points).sum(1) / np.linalg.norm(points, axis=1)
+    at = points[:, :2] / points[:, 2:].clip(1e-3) * [K[0, 0], K[1, 1]] + K[:2, 2]
+    edge = np.array(depth.shape[::-1]) - 3
+    u, v = np.floor(at + 0.5).clip(0, edge + 2).astype(int).T
+    z = depth[v, u]
+    seen = (z > 0) & (np.abs(z - points[:, 2]) < 0.004 + 0.03 * size) & (cosine > 0.25)
+    seen &= ((at > 2) & (at < edge)).all(1)
+    if seen.sum() < 30:
+        return None
+    points, normals, cosine, at = points[seen], normals[seen], cosine[seen], at[seen]
+    middle, focal = R @ center + pose[:3, 3], K[0, 0]
+    sigma = blurred * max(0.5, 0.33 * spacing * focal / middle[2])
+    shown = np.log(blur(image["rgb"] / 255, sigma) + 0.03)
+    y, halves = look(shown, at), 0.5 * np.eye(2)
+    along = np.stack([look(shown, at + half) - look(shown, at - half) for half in halves], -1)
+    basis, weights = np.concatenate([np.ones((len(at), 1)), normals], 1), cosine
+    both = np.concatenate([own[2][seen], y], 1)
+    for again in (True, True, False):  # points that do not fit lose their weight
+        x, y = np.split(leave(both[None], basis[None], weights[None])[0], 2, axis=1)
+        power = weights[:, None] * x
+        gain = (power * y).sum() / (power * x).sum().clip(1e-12)
+        if again:
+            left = y - gain * x
+            spread = max(0.01, 1.4826 * np.sort(np.abs(left), None)[(left.size - 1) // 2])
+            weights = cosine / (1 + (left**2).mean(1) / (2 * spread) ** 2)
+    energy = (power * x).sum() * (weights[:, None] * y**2).sum()
+    if not (power * y).sum() > min_correlation * np.sqrt(energy):
+        return None
+    by_point = np.zeros((len(at), 2, 3))
+    by_point[:, 0, 0], by_point[:, 1, 1] = K[0, 0] / points[:, 2], K[1, 1] / points[:, 2]
+    by_point[:, :, 2] = -points[:, :2] * [K[0, 0], K[1, 1]] / points[:, 2:] ** 2
+    by_turn = np.cross((points - middle)[:, None], by_point) @ R
+    by_shift = np.eye(6)[sides[seen]][:, None, :, None] * (by_point @ R)[:, :, None]
+    rows = along @ np.concatenate([by_point, by_turn, by_shift.reshape(len(at), 2, 18)], 2)
+    rows = leave(rows.reshape(1, len(at), 72), basis[None], weights[None])[0]
+    rows = rows.reshape(len(at), 3, 24)
+    rows = rows - x[..., None] * ((power[..., None] * rows).sum((0, 1)) / (power * x).sum())
+    left = y - gain * x
+    variance = (weights[:, None] * left**2).sum() / (3 * weights.sum())
+    covered = (weights * (spacing * focal / points[:, 2]) ** 2).sum()
+    count = min(len(at), covered / (2 * max(1, sigma**2)))
+    scale = independent * count / len(at) / max(variance, 0.01**2)
+    weighted = scale * rows * weights[:, None, None]
+    information = np.einsum("ncd,nce->de", weighted, rows)
+    slope = -np.einsum("ncd,nc->d", weighted, left)
+    own_shifts = information[6:, 6:] + np.eye(18) / texture_error**2
+    part = np.linalg.solve(own_shifts, information[6:, :6]).T
+    return information[:6, :6] - part @ information[6:, :6], slope[:6] - part @ slope[6:]
 
 
 def leave(values, basis, weight):

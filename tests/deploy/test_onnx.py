@@ -20,14 +20,16 @@ from posefilter.cli import run_command
 from posefilter.cli.checkpoints import build_method, recipe
 from posefilter.cli.command import compose_job
 from posefilter.deploy.resizing import Resize
-from posefilter.deploy.settings import describe_filter, describe_rotations
+from posefilter.deploy.settings import describe_alignment, describe_filter, describe_rotations
 from posefilter.deploy.write import make_graphs, to_program, write_filter
 from posefilter.errors import UserError
 from posefilter.filters.icp import PointToPlaneIcp
 from posefilter.filters.texture import TextureRotations, list_rotations
+from posefilter.filters.texture_alignment import TextureAlignment
 from posefilter.geometry.camera import project
 from posefilter.geometry.pose import fit_rigid, is_rigid, make_pose, move_about
 from posefilter.geometry.rotation import random_rotation
+from posefilter.geometry.spaces import PoseSpace
 from posefilter.images import check_images, make_batch
 from posefilter.models.base import PoseEstimator
 from posefilter.models.zoom import find_place, magnify, measure_zoom
@@ -174,6 +176,38 @@ def test_the_example_aligns_as_torch_does(
         ours = own.align(image, start[0].numpy(), surface, **vars(icp))
         assert np.abs(theirs - start[0].numpy()).max() > 8e-3
         assert np.abs(ours - theirs).max() < 1e-3  # pixels are rounded in another precision
+
+
+@pytest.mark.parametrize("name", ["soup_can", "carton"])
+def test_the_example_lays_the_print_on_the_image_as_torch_does(
+    name: str, poses: ModuleType
+) -> None:
+    model, align = load(name), TextureAlignment(min_gain=0.0)
+    own = poses.PoseFilter.__new__(poses.PoseFilter)
+    own.center, own.radius = model.center.numpy(), float(model.radius)
+    own.settings = {"diameter": model.diameter}
+    described = describe_alignment(align, model)
+    space = PoseSpace(tuple(model.center.tolist()), model.radius)
+    method: Any = SimpleNamespace(object_model=model)
+    moved = 0
+    for seed in range(4):
+        g = torch.Generator().manual_seed(seed)
+        R = random_rotation(1, generator=g)[0]
+        truth = make_pose(R, torch.tensor([0.0, 0, 4.5 * model.radius]) - R @ model.center)
+        encoding = look(name, truth)
+        noise = space.noise_scale(torch.tensor(0.004)) * torch.randn(1, 6, generator=g)
+        start = space.move(truth[None], noise)
+        given = BeliefBatch(start[:, None], torch.zeros(1, 1), start, torch.zeros(1))
+        theirs = align(given, encoding, method, torch.Generator()).best[0].numpy()
+        image = {
+            "rgb": 255 * encoding.measured_color[0].movedim(0, 2).numpy(),
+            "depth": encoding.measured_depth[0].numpy(),
+            "intrinsics": encoding.intrinsics[0].numpy(),
+        }
+        ours = own.align_print(image, start[0].numpy(), **described)
+        moved += not np.array_equal(theirs, start[0].numpy())
+        assert np.abs(ours - theirs).max() < 1e-3  # pixels are rounded in another precision
+    assert moved >= 3
 
 
 @pytest.mark.parametrize("name", ["soup_can", "carton"])

@@ -12,11 +12,13 @@ from posefilter.filters.agreement import Agreement
 from posefilter.filters.icp import PointToPlaneIcp
 from posefilter.filters.loop import ParticleFilter
 from posefilter.filters.texture import (
+    Print,
     TextureRotations,
     coarsen_texture,
     list_rotations,
     read_print,
 )
+from posefilter.filters.texture_alignment import TextureAlignment, find_sides
 from posefilter.models.base import PoseEstimator
 from posefilter.models.image_space import ImageSpace
 from posefilter.models.pose_pf import PosePF
@@ -174,8 +176,42 @@ def _describe_refinement(one: Any, method: PoseEstimator) -> list[dict[str, Any]
         return [{"kind": "icp", **own, "surface": surface}]
     if isinstance(one, TextureRotations) and isinstance(method, PosePF):
         return describe_rotations(one, method.object_model)
-    choices = ("mean_shift_icp_texture", "mean_shift_icp", "mean_shift", "rescore", "none")
+    if isinstance(one, TextureAlignment) and isinstance(method, PosePF):
+        return [describe_alignment(one, method.object_model)]
+    choices = (
+        "mean_shift_icp_texture_alignment",
+        "mean_shift_icp_texture",
+        "mean_shift_icp",
+        "mean_shift",
+        "rescore",
+        "none",
+    )
     raise _refuse(one, "refine", *choices)
+
+
+def describe_alignment(one: TextureAlignment, object_model: ObjectModel) -> dict[str, Any]:
+    """Return what an alignment with the texture needs."""
+    own = read_print(object_model)
+    names = (
+        *("iterations", "initial_blur", "prior", "independent", "min_correlation"),
+        *("texture_error", "min_gain", "gate"),
+    )
+    return {
+        "kind": "texture_alignment",
+        **{name: getattr(one, name) for name in names},
+        "noise": one.depth.noise,
+        "effective": one.depth.effective,
+        "surface": one.depth.choose_points(object_model.points).tolist(),
+        "print": _list_print(own),
+        "spacing": own.spacing,
+        "sides": find_sides(own.normals).tolist(),
+    }
+
+
+def _list_print(own: Print) -> list[list[float]]:
+    """Return textured points as rows of nine numbers."""
+    rows = torch.cat([own.points, own.normals, own.color], dim=1).tolist()
+    return [[round(x, 5) for x in row] for row in rows]
 
 
 def describe_rotations(one: TextureRotations, object_model: ObjectModel) -> list[dict[str, Any]]:
@@ -184,12 +220,11 @@ def describe_rotations(one: TextureRotations, object_model: ObjectModel) -> list
     if len(turns) == 1:
         return []
     own = read_print(coarsen_texture(object_model))
-    surface = torch.cat([own.points, own.normals, own.color], dim=1)
     return [
         {
             "kind": "texture",
             **{name: getattr(one, name) for name in ("learned_weight", "pixels", "sigma")},
-            "surface": [[round(x, 5) for x in row] for row in surface.tolist()],
+            "surface": _list_print(own),
             "spacing": own.spacing,
             "turns": [[round(x, 6) for x in turn[:3].flatten().tolist()] for turn in turns],
             "coarse": coarse.tolist(),
