@@ -106,11 +106,13 @@ def coarsen_texture(object_model: ObjectModel, most: int = _COARSE) -> ObjectMod
     # a point on the other side of a thin wall is not near
     side = _WALL * object_model.diameter
     places = torch.cat([texture[:, :3], side * texture[:, 3:6]], dim=1).float()
-    nearest = torch.cdist(places, places[:most]).argmin(1)
+    # every so many: points are drawn face by face, and the first ones are of some faces alone
+    kept = torch.arange(most, device=texture.device) * len(texture) // most
+    nearest = torch.cdist(places, places[kept]).argmin(1)
     total = places.new_zeros(most, 4).index_add(
         0, nearest, torch.cat([texture[:, 6:].float(), places.new_ones(len(texture), 1)], dim=1)
     )
-    coarse = torch.cat([texture[:most, :6].float(), total[:, :3] / total[:, 3:]], dim=1)
+    coarse = torch.cat([texture[kept, :6].float(), total[:, :3] / total[:, 3:]], dim=1)
     return object_model._replace(texture=coarse.to(texture.dtype))
 
 
