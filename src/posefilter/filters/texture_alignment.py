@@ -159,31 +159,26 @@ class TextureAlignment:
             object_model: The object.
             blur: Of the image, in units of what suits the textured points' distance.
         """
-        K, size = image.intrinsics, image.color.shape[:0:-1]  # width, height
-        points, normals = transform(pose, own.points), own.normals @ rotation_of(pose).mT
-        cosine = -(normals * F.normalize(points, dim=-1)).sum(-1)
-        pixels = project(points, K)
-        z = gather_pixels(image.depth[None, None], nearest_pixel(pixels)[None])[0, :, 0]
-        inside = (pixels > _RIM) & (pixels < pixels.new_tensor(size) - 1 - _RIM)
-        seen = near_surface(z, points[:, 2], object_model) & (cosine > GRAZING) & inside.all(-1)
+        seen = find_seen(pose, image, own, object_model)
         if int(seen.sum()) < _FEW:
             return None
-        points, normals, cosine, pixels = (x[seen] for x in (points, normals, cosine, pixels))
-        focal = float(K[0, 0])
+        K, focal = image.intrinsics, float(image.intrinsics[0, 0])
+        points, normals = (
+            transform(pose, own.points[seen]),
+            own.normals[seen] @ rotation_of(pose).mT,
+        )
         center = origin_of(pose[None], object_model.center.to(pose))[0]
         sigma = blur * choose_blur(own, focal, float(center[2]))
-        y, along = _look_up(image.color, pixels, sigma)
+        y, along = _look_up(image.color, project(points, K), sigma)
+        cosine = _face_camera(points, normals)
         basis = torch.cat([torch.ones_like(cosine)[:, None], normals], dim=-1)
-        x, y, weights, gain = self._fit(own.color[seen], y, basis, cosine)
+        x, y, weights, gain = _fit(own.color[seen], y, basis, cosine)
         power = weights[:, None] * x
         correlation = (power * y).sum() / ((power * x).sum() * _square(y, weights)).sqrt()
         if not float(correlation) > self.min_correlation:
             return None
         by_twist = pixel_derivatives(points, points - center, pose, K)
-        sides = F.one_hot(find_sides(own.normals)[seen], _SIDES).to(pose)
-        # a shift of a side's print, in the object's axes
-        by_shift = by_twist[..., :3] @ rotation_of(pose)
-        by_shift = (sides[:, None, :, None] * by_shift[:, :, None]).flatten(2)  # (n, 2, 3 sides)
+        by_shift = _shift_sides(by_twist, find_sides(own.normals)[seen], pose)
         slopes = along @ torch.cat([by_twist, by_shift], dim=-1)
         rows = remove_linear(slopes.flatten(1)[None], basis[None], weights[None])[0]
         rows = rows.unflatten(1, (3, -1)).double()
@@ -204,36 +199,6 @@ class TextureAlignment:
         part = torch.linalg.solve(information[6:, 6:] + prior, both).mT
         return Term(information[:6, :6] - part @ both, slope[:6] - part @ slope[6:])
 
-    def _fit(
-        self, color: Tensor, seen: Tensor, basis: Tensor, weights: Tensor
-    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Return the colors of object and image without shading, the points' robust weights, and
-        the gain between them.
-
-        (n, 3), (n, 3), (n, 4), (n,) -> (n, 3), (n, 3), (n,), ().
-        """
-        plain = weights
-        for last in reversed(range(_REWEIGHTED)):
-            both = torch.cat([color, seen], dim=1)
-            x, y = remove_linear(both[None], basis[None], weights[None])[0].chunk(2, dim=1)
-            power = weights[:, None] * x
-            gain = (power * y).sum() / (power * x).sum().clamp_min(1e-12)
-            if not last:
-                break
-            residual = y - gain * x
-            spread = (1.4826 * residual.abs().median()).clamp_min(_LEAST_NOISE)
-            weights = plain / (1 + residual.square().mean(1) / (_OUTLIER * spread).square())
-        return x, y, weights, gain
-
-
-def find_sides(normals: Tensor) -> Tensor:
-    """Return which of six sides of an object a point is on, by its normal: those of the axes that
-    the normals gather about.  (P, 3) -> (P,).
-    """
-    axes = torch.linalg.eigh(normals.mT @ normals).eigenvectors
-    along = normals @ axes
-    return torch.cat([along, -along], dim=1).argmax(1)
-
 
 class _Image(NamedTuple):
     """One image."""
@@ -246,6 +211,63 @@ class _Image(NamedTuple):
 def _images(encoding: HasColor) -> list[_Image]:
     parts = (encoding.measured_color, encoding.measured_depth, encoding.intrinsics)
     return [_Image(*one) for one in zip(*parts, strict=True)]
+
+
+def find_seen(pose: Tensor, image: _Image, own: Print, object_model: ObjectModel) -> Tensor:
+    """Return which textured points the image shows, not too near its rim.  (4, 4) -> (P,) bool."""
+    size = image.color.shape[:0:-1]  # width, height
+    points, normals = transform(pose, own.points), own.normals @ rotation_of(pose).mT
+    pixels = project(points, image.intrinsics)
+    z = gather_pixels(image.depth[None, None], nearest_pixel(pixels)[None])[0, :, 0]
+    inside = (pixels > _RIM) & (pixels < pixels.new_tensor(size) - 1 - _RIM)
+    facing = _face_camera(points, normals) > GRAZING
+    return near_surface(z, points[:, 2], object_model) & facing & inside.all(-1)
+
+
+def find_sides(normals: Tensor) -> Tensor:
+    """Return which of six sides of an object a point is on, by its normal: those of the axes that
+    the normals gather about.  (P, 3) -> (P,).
+    """
+    axes = torch.linalg.eigh(normals.mT @ normals).eigenvectors
+    along = normals @ axes
+    return torch.cat([along, -along], dim=1).argmax(1)
+
+
+def _face_camera(points: Tensor, normals: Tensor) -> Tensor:
+    """Return the cosines between surfaces and the ways to the camera.  (n, 3), (n, 3) -> (n,)."""
+    return -(normals * F.normalize(points, dim=-1)).sum(-1)
+
+
+def _fit(
+    color: Tensor, seen: Tensor, basis: Tensor, weights: Tensor
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Return the colors of object and image without shading, the points' robust weights, and the
+    gain between them.
+
+    (n, 3), (n, 3), (n, 4), (n,) -> (n, 3), (n, 3), (n,), ().
+    """
+    plain = weights
+    for last in reversed(range(_REWEIGHTED)):
+        both = torch.cat([color, seen], dim=1)
+        x, y = remove_linear(both[None], basis[None], weights[None])[0].chunk(2, dim=1)
+        power = weights[:, None] * x
+        gain = (power * y).sum() / (power * x).sum().clamp_min(1e-12)
+        if not last:
+            break
+        residual = y - gain * x
+        spread = (1.4826 * residual.abs().median()).clamp_min(_LEAST_NOISE)
+        weights = plain / (1 + residual.square().mean(1) / (_OUTLIER * spread).square())
+    return x, y, weights, gain
+
+
+def _shift_sides(by_twist: Tensor, sides: Tensor, pose: Tensor) -> Tensor:
+    """Return how pixels move with shifts of each side's print, in the object's axes.
+
+    (n, 2, 6), (n,), (4, 4) -> (n, 2, 3 sides) [px/m].
+    """
+    by_shift = by_twist[..., :3] @ rotation_of(pose)
+    on_side = F.one_hot(sides, _SIDES).to(pose)
+    return (on_side[:, None, :, None] * by_shift[:, :, None]).flatten(2)
 
 
 def _square(values: Tensor, weights: Tensor) -> Tensor:
