@@ -89,7 +89,7 @@ class TextureAlignment:
         independent: float = 0.3,
         min_correlation: float = 0.5,
         texture_error: float = 0.002,
-        min_gain: float = 10.0,
+        min_gain: float = 20.0,
         gate: float = 0.006,
         noise: float = 0.004,
         effective: float = 240.0,
