@@ -184,11 +184,11 @@ class PoseFilter:
             weights = weights * min(1, effective / max(weights.sum(), 10)) / noise**2
             information, slope = (rows.T * weights) @ rows, rows.T @ (weights * along)
             blurred = initial_blur ** (1 - (index + 1) / iterations)
-            told = read_print(image, pose, own, np.array(sides), self.center, spacing, size,
+            term = read_print(image, pose, own, np.array(sides), self.center, spacing, size,
                               blurred, **step)  # fmt: skip
-            known = told is not None
+            known = term is not None
             if known:
-                information, slope = information + told[0], slope + told[1]
+                information, slope = information + term[0], slope + term[1]
             twist = np.linalg.solve(information + precision, slope - precision @ moved)
             pose, moved = move(pose[None], twist[None], self.center)[0], moved + twist
         both = np.stack([best, np.float32(pose)])

@@ -129,13 +129,13 @@ def check_override(override: str, folder: Path) -> None:
             f"resume={folder}: its {key} calls a function; if that is right, type "
             f"{key}=... yourself"
         )
-    sent = key == "logger" and any(name in re.split(r"[\[\],'\"\s]+", value) for name in _SENDING)
-    if sent or key.startswith("logger."):
+    words = [word for word in re.split(r"[\[\]{},\s'\"]|:(?!//)", value) if word]
+    sends = key == "logger" and not {*words}.isdisjoint(_SENDING)
+    if sends or key.startswith("logger."):
         raise UserError(
             f"resume={folder}: its {key}={value} may send results elsewhere; if it is right, "
             f"type it as well"
         )
-    words = [word for word in re.split(r"[\[\]{},\s'\"]|:(?!//)", value) if word]
     place = key.rpartition(".")[2] in _PLACES and value not in ("", "null")
     if place or not all(stays_inside(word, Path()) for word in words):
         raise UserError(

@@ -205,10 +205,10 @@ class PasteOccluder:
         distance = sample.camera_from_object[2, 3] * rng.uniform(0.72, 0.94)
         surface = distance * (1 - 0.05 * (1 - a * a) + 0.03 * b * rng.normal())
         behind = sample.depth[cut][patch]
-        if (
-            behind > 0
-        ).any() and distance > 0:  # a deep object reaches further to the camera than its origin
-            surface *= min(1.0, 0.98 * behind[behind > 0].min() / surface[patch].max())
+        known = behind[behind > 0]
+        if known.size and distance > 0:
+            # a deep object reaches further to the camera than its origin
+            surface *= min(1.0, 0.98 * known.min() / surface[patch].max())
         drawn = draw(rng).rgb
         if drawn.shape != sample.rgb.shape:  # images of several sizes
             drawn = cv2.resize(drawn, sample.mask.shape[::-1], interpolation=cv2.INTER_AREA)

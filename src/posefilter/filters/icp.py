@@ -131,14 +131,7 @@ class PointToPlaneIcp:
     def _pair(
         self, pose: Tensor, own: Tensor, center: Tensor, encoding: HasDepth, width: float
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """Pair surface points with what is measured at their pixels.
-
-        Args:
-            pose: (B, 4, 4) camera_from_object [m].
-            own: (P, 3) surface points [m].
-            center: (3,) the object's center [m].
-            encoding: Depth and camera.
-            width: Of the loss [m].
+        """Pair surface points with what is measured at their pixels; arguments as of `measure`.
 
         Returns:
             Derivatives (B, P, 6) of each point's place along the measured normal by the twist, how

@@ -22,7 +22,7 @@ from posefilter.protocols import Encoding, HasColor, Method, ScoresPoses
 from posefilter.types import BeliefBatch, ObjectModel
 
 DARK = 0.03  # added to colors before the logarithm, so that black does not decide
-GRAZING = 0.25  # cosine of the angle between a surface and the way to the camera
+_GRAZING = 0.25  # cosine of the angle between a surface and the way to the camera
 _NEAR = (0.004, 0.03)  # [m, diameters] between a point and what is measured at its pixel
 _BLUR = 0.33  # of the distance between neighboring points
 _SHARPEST = 0.5  # [px]
@@ -126,13 +126,7 @@ def _compare(
     shift: float,
 ) -> Tensor:
     """Return the ratios of poses in one image.  (C, 4, 4), (3, H, W), (H, W), (3, 3) -> (C,)."""
-    points = transform(poses, own.points)
-    normals = own.normals @ rotation_of(poses).mT
-    cosine = -(normals * F.normalize(points, dim=-1)).sum(-1)
-    pixels = project(points, K)
-    at = nearest_pixel(pixels).flatten(0, 1)
-    z = gather_pixels(depth[None, None], at[None])[0, :, 0].unflatten(0, cosine.shape)
-    seen = near_surface(z, points[..., 2], object_model) & (cosine > GRAZING)
+    points, normals, cosine, pixels, seen = look_at_print(poses, depth, K, own, object_model)
     weights = seen * cosine
     focal = float(K[0, 0])
     covered = (weights * (own.spacing * focal / points[..., 2].clamp_min(0.05)).square()).sum(-1)
@@ -152,10 +146,36 @@ def _compare(
     return -0.5 * count * torch.log1p(-best.clamp_max(_LARGEST).square())
 
 
-def near_surface(measured: Tensor, depth: Tensor, object_model: ObjectModel) -> Tensor:
-    """Return whether points are what is measured at their pixels, by their depths [m]."""
-    near = (measured - depth).abs() < _NEAR[0] + _NEAR[1] * object_model.diameter
-    return (measured > 0) & near
+class View(NamedTuple):
+    """Textured points at C poses."""
+
+    points: Tensor  # (C, P, 3) [m] in the camera's frame
+    normals: Tensor  # (C, P, 3) likewise
+    cosine: Tensor  # (C, P) of the angle between the surface and the way to the camera
+    pixels: Tensor  # (C, P, 2) [px]
+    seen: Tensor  # (C, P) bool: it faces the camera, and is what is measured at its pixel
+
+
+def look_at_print(
+    poses: Tensor, depth: Tensor, K: Tensor, own: Print, object_model: ObjectModel
+) -> View:
+    """Return where textured points are, and which of them an image shows.
+
+    Args:
+        poses: (C, 4, 4) camera_from_object [m].
+        depth: (H, W) of the image [m].
+        K: (3, 3) of its camera.
+        own: The object's textured points.
+        object_model: The object.
+    """
+    points = transform(poses, own.points)
+    normals = own.normals @ rotation_of(poses).mT
+    cosine = -(normals * F.normalize(points, dim=-1)).sum(-1)
+    pixels = project(points, K)
+    at = nearest_pixel(pixels).flatten(0, 1)
+    z = gather_pixels(depth[None, None], at[None])[0, :, 0].unflatten(0, cosine.shape)
+    near = (z - points[..., 2]).abs() < _NEAR[0] + _NEAR[1] * object_model.diameter
+    return View(points, normals, cosine, pixels, (z > 0) & near & (cosine > _GRAZING))
 
 
 def choose_blur(own: Print, focal: float, distance: float) -> float:

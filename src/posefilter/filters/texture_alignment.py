@@ -12,18 +12,16 @@ from posefilter.filters.icp import PointToPlaneIcp
 from posefilter.filters.refine import object_of
 from posefilter.filters.texture import (
     DARK,
-    GRAZING,
     Print,
     blur_around,
     choose_blur,
+    look_at_print,
     measure_texture,
-    near_surface,
     read_print,
     remove_linear,
 )
-from posefilter.geometry.camera import project
-from posefilter.geometry.lookup import gather_pixels, nearest_pixel, sample
-from posefilter.geometry.pose import origin_of, rotation_of, transform
+from posefilter.geometry.lookup import sample
+from posefilter.geometry.pose import origin_of, rotation_of
 from posefilter.geometry.spaces import PoseSpace
 from posefilter.protocols import Encoding, HasColor, Method
 from posefilter.types import BeliefBatch, ObjectModel
@@ -127,6 +125,7 @@ class TextureAlignment:
         space = PoseSpace(tuple(object_model.center.tolist()), object_model.radius)
         precision = space.noise_scale(first.new_tensor(self.prior)).double().pow(-2).diag()
         surface = self.depth.choose_points(object_model.points).to(first)
+        sides, images = find_sides(own.normals), _images(encoding)
         pose, known = first, torch.zeros(len(first), dtype=torch.bool, device=first.device)
         moved = first.new_zeros(len(first), 6, dtype=torch.float64)
         for index in range(self.iterations):
@@ -134,8 +133,8 @@ class TextureAlignment:
             information, slope, _ = self.depth.measure(
                 pose, surface, object_model.center.to(first), encoding, self.gate
             )
-            for row, image in enumerate(_images(encoding)):
-                term = self._compare(pose[row], image, own, object_model, blur)
+            for row, image in enumerate(images):
+                term = self._compare(pose[row], image, own, sides, object_model, blur)
                 known[row] = term is not None
                 if term is not None:
                     information[row] += term.information
@@ -148,7 +147,13 @@ class TextureAlignment:
         return belief._replace(best=torch.where(better[:, None, None], pose, first))
 
     def _compare(
-        self, pose: Tensor, image: "_Image", own: Print, object_model: ObjectModel, blur: float
+        self,
+        pose: Tensor,
+        image: "_Image",
+        own: Print,
+        sides: Tensor,
+        object_model: ObjectModel,
+        blur: float,
     ) -> Term | None:
         """Return what the colors say of a pose's twist; None where they say nothing.
 
@@ -156,21 +161,21 @@ class TextureAlignment:
             pose: (4, 4) camera_from_object [m].
             image: What it is compared with.
             own: The object's textured points.
+            sides: (P,) which side each is on.
             object_model: The object.
             blur: Of the image, in units of what suits the textured points' distance.
         """
-        seen = find_seen(pose, image, own, object_model)
+        K, focal = image.intrinsics, float(image.intrinsics[0, 0])
+        view = look_at_print(pose[None], image.depth, K, own, object_model)
+        size = view.pixels.new_tensor(image.color.shape[:0:-1])  # width, height
+        inside = (view.pixels > _RIM) & (view.pixels < size - 1 - _RIM)
+        seen = (view.seen & inside.all(-1))[0]
         if int(seen.sum()) < _FEW:
             return None
-        K, focal = image.intrinsics, float(image.intrinsics[0, 0])
-        points, normals = (
-            transform(pose, own.points[seen]),
-            own.normals[seen] @ rotation_of(pose).mT,
-        )
+        points, normals, cosine, pixels = (part[0, seen] for part in view[:4])
         center = origin_of(pose[None], object_model.center.to(pose))[0]
         sigma = blur * choose_blur(own, focal, float(center[2]))
-        y, along = _look_up(image.color, project(points, K), sigma)
-        cosine = _face_camera(points, normals)
+        y, along = _look_up(image.color, pixels, sigma)
         basis = torch.cat([torch.ones_like(cosine)[:, None], normals], dim=-1)
         x, y, weights, gain = _fit(own.color[seen], y, basis, cosine)
         power = weights[:, None] * x
@@ -178,11 +183,11 @@ class TextureAlignment:
         if not float(correlation) > self.min_correlation:
             return None
         by_twist = pixel_derivatives(points, points - center, pose, K)
-        by_shift = _shift_sides(by_twist, find_sides(own.normals)[seen], pose)
+        by_shift = _shift_sides(by_twist, sides[seen], pose)
         slopes = along @ torch.cat([by_twist, by_shift], dim=-1)
         rows = remove_linear(slopes.flatten(1)[None], basis[None], weights[None])[0]
         rows = rows.unflatten(1, (3, -1)).double()
-        # of what the gain explains as well nothing is told
+        # what the gain explains as well says nothing of the pose
         share = (power[..., None].double() * rows).sum((0, 1)) / (power * x).sum().double()
         rows = rows - x[..., None].double() * share
         residual = (y - gain * x).double()
@@ -213,17 +218,6 @@ def _images(encoding: HasColor) -> list[_Image]:
     return [_Image(*one) for one in zip(*parts, strict=True)]
 
 
-def find_seen(pose: Tensor, image: _Image, own: Print, object_model: ObjectModel) -> Tensor:
-    """Return which textured points the image shows, not too near its rim.  (4, 4) -> (P,) bool."""
-    size = image.color.shape[:0:-1]  # width, height
-    points, normals = transform(pose, own.points), own.normals @ rotation_of(pose).mT
-    pixels = project(points, image.intrinsics)
-    z = gather_pixels(image.depth[None, None], nearest_pixel(pixels)[None])[0, :, 0]
-    inside = (pixels > _RIM) & (pixels < pixels.new_tensor(size) - 1 - _RIM)
-    facing = _face_camera(points, normals) > GRAZING
-    return near_surface(z, points[:, 2], object_model) & facing & inside.all(-1)
-
-
 def find_sides(normals: Tensor) -> Tensor:
     """Return which of six sides of an object a point is on, by its normal: those of the axes that
     the normals gather about.  (P, 3) -> (P,).
@@ -231,11 +225,6 @@ def find_sides(normals: Tensor) -> Tensor:
     axes = torch.linalg.eigh(normals.mT @ normals).eigenvectors
     along = normals @ axes
     return torch.cat([along, -along], dim=1).argmax(1)
-
-
-def _face_camera(points: Tensor, normals: Tensor) -> Tensor:
-    """Return the cosines between surfaces and the ways to the camera.  (n, 3), (n, 3) -> (n,)."""
-    return -(normals * F.normalize(points, dim=-1)).sum(-1)
 
 
 def _fit(
