@@ -339,9 +339,10 @@ MESHES = {
     "faces that all meet": (CORNERS + "f " + "1 2 3 " * 30_000, "meet in one place"),
     "corners at the end of numbers": ("v 0 0 0\nv 1e308 0 0\nv 0 1 0\nf 1 2 3\n", "mind the unit"),
     "an index of 30 digits": (CORNERS + f"f 1 2 {'9' * 30}\n", "not a readable mesh"),
-    "one picture 60 times": (
-        "mtllib x.mtl\n" + CORNERS + "".join(f"usemtl m{i}\nf 1/1 2/1 3/1\n" for i in range(60)),
-        "60 textures",
+    "one picture 8,100 times": (
+        f"mtllib x.mtl\n{CORNERS}vt 90 0\nvt 0 90\n"
+        "usemtl m0\nf 1/1 2/2 3/3\nusemtl m1\nf 1/1 2/1 3/1\n",
+        "repeated 8100 times",
     ),
     "twenty pictures": ("mtllib many.mtl\n" + CORNERS + "f 1/1 2/1 3/1\n", "scale them down"),
 }
@@ -349,9 +350,9 @@ MESHES = {
 
 @pytest.fixture(scope="module")
 def pictures(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return a folder with pictures of one color, and materials that name them."""
+    """Return a folder with large pictures, and materials that name them."""
     folder = tmp_path_factory.mktemp("pictures")
-    cv2.imwrite(str(folder / "p0.png"), np.zeros((4000, 4000, 3), np.uint8))
+    cv2.imwrite(str(folder / "p0.png"), np.eye(4000, dtype=np.uint8))
     for i in range(1, 20):
         (folder / f"p{i}.png").write_bytes((folder / "p0.png").read_bytes())
     for name, same in (("x", True), ("many", False)):

@@ -4,14 +4,14 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import trimesh
 
 from posefilter.errors import UserError
+from posefilter.meshes.atlas import merge_materials
 from posefilter.meshes.glb import check_glb
-from posefilter.meshes.mesh import Mesh, creased_normals
-from posefilter.meshes.obj import MOST_TEXELS, PLAIN, Material, RawMesh, read_image, read_obj
+from posefilter.meshes.mesh import Mesh, creased_normals, looks_inward
+from posefilter.meshes.obj import PLAIN, Material, RawMesh, read_image, read_obj
 from posefilter.meshes.ply import open_ply
 
 SUFFIXES = (".obj", ".ply", ".glb")
@@ -67,6 +67,9 @@ def _finish(raw: RawMesh, path: Path, name: str, scale: float) -> Mesh:
     vertices = raw.vertices[used].astype(np.float64) * scale
     if np.abs(vertices).max() > _FARTHEST:
         raise UserError(f"{path}: vertices farther than {_FARTHEST:,.0f} m; mind the unit")
+    turned = looks_inward(vertices, faces)
+    if turned:
+        faces, raw = faces[:, ::-1], _reverse_corners(raw)
     try:
         normals = creased_normals(vertices, faces)
     except ValueError as error:
@@ -74,45 +77,20 @@ def _finish(raw: RawMesh, path: Path, name: str, scale: float) -> Mesh:
     if raw.corner_normals is not None:
         length = np.linalg.norm(raw.corner_normals, axis=-1, keepdims=True)
         given = raw.corner_normals / np.maximum(length, 1e-12)
+        if turned and (given * normals).sum() < 0:
+            given = -given
         normals = np.where(length > 1e-6, given, normals).astype(np.float32)
-    uv, texture = _one_texture(raw, path)
-    colors = None if raw.corner_colors is None else raw.corner_colors.astype(np.float32)
+    uv, texture, colors = merge_materials(raw, path)
     return Mesh(name, vertices, faces, uv, texture, colors, normals)
 
 
-def _one_texture(raw: RawMesh, path: Path) -> tuple[np.ndarray | None, np.ndarray]:
-    """Stack all materials into one texture; a mesh of one plain color gets one pixel."""
-    used = np.unique(raw.face_material)
-    pictures = [_picture(raw.materials[i]) for i in used]
-    if len(used) == 1 and (raw.corner_uv is None or pictures[0].shape[:2] == (1, 1)):
-        return None, pictures[0][:1, :1]
-    uv = np.zeros((len(raw.faces), 3, 2))
-    if raw.corner_uv is not None:
-        uv = raw.corner_uv.astype(np.float64)
-    if len(used) == 1:
-        return uv.astype(np.float32), pictures[0]
-    height = max(p.shape[0] for p in pictures)
-    width = max(p.shape[1] for p in pictures)
-    if len(used) * height * width > MOST_TEXELS:
-        raise UserError(
-            f"{path}: too large: {len(used)} textures of {width}x{height} pixels; scale them down"
-        )
-    stack = np.concatenate([cv2.resize(p, (width, height)) for p in pictures])
-    which = np.searchsorted(used, raw.face_material)
-    # a stacked picture cannot repeat: fold each face back
-    uv = uv - np.floor(uv.mean(axis=1, keepdims=True))
-    inset = 0.5 / np.array([width, height])
-    uv = uv.clip(inset, 1 - inset)
-    uv[..., 1] = (uv[..., 1] + (len(used) - 1 - which)[:, None]) / len(used)
-    return uv.astype(np.float32), stack
-
-
-def _picture(material: Material) -> np.ndarray:
-    if material.image is None:
-        return np.round(material.color * 255).astype(np.uint8).reshape(1, 1, 3)
-    if np.allclose(material.color, 1):
-        return material.image
-    return np.round(material.image * material.color).astype(np.uint8)
+def _reverse_corners(raw: RawMesh) -> RawMesh:
+    """Return a mesh with the corners of its faces in the reverse order."""
+    parts = {name: getattr(raw, name) for name in ("corner_uv", "corner_normals", "corner_colors")}
+    return raw._replace(
+        faces=raw.faces[:, ::-1],
+        **{name: part[:, ::-1] for name, part in parts.items() if part is not None},
+    )
 
 
 def _read_other(path: Path) -> RawMesh:
@@ -122,7 +100,7 @@ def _read_other(path: Path) -> RawMesh:
     else:
         check_glb(path)
         loaded = trimesh.load(path, process=False)
-    parts = loaded.dump() if isinstance(loaded, trimesh.Scene) else [loaded]
+    parts = _list_parts(loaded) if isinstance(loaded, trimesh.Scene) else [loaded]
     raws = [_from_trimesh(part, path) for part in parts if isinstance(part, trimesh.Trimesh)]
     if not raws:
         raise UserError(f"{path}: the mesh has no triangles (is it a point cloud, or cut short?)")
@@ -150,6 +128,17 @@ def _read_other(path: Path) -> RawMesh:
     )
 
 
+def _list_parts(scene: trimesh.Scene) -> list[Any]:
+    """Return what a scene shows, where it shows it."""
+    parts: list[Any] = scene.dump()
+    for part in parts:
+        shape: Any = scene.geometry[part.metadata["name"]]
+        own = getattr(getattr(shape, "visual", None), "vertex_attributes", {})
+        if "color" in own:  # beside a material; copies have lost them
+            part.visual.vertex_attributes["color"] = own["color"]
+    return parts
+
+
 def _load_ply(path: Path) -> Any:
     """Load a PLY file. Raises UserError unless the picture that it names can be read: trimesh would
     ignore that.
@@ -166,9 +155,12 @@ def _from_trimesh(mesh: trimesh.Trimesh, path: Path) -> RawMesh:
     visual = mesh.visual
     uv = colors = None
     material = PLAIN
+    linear = path.suffix.lower() == ".glb"  # factors and colors of vertices, by the format
     if isinstance(visual, trimesh.visual.TextureVisuals):
         uv = None if visual.uv is None else np.asarray(visual.uv)[faces]
         material = _trimesh_material(visual.material)
+        own = visual.vertex_attributes.get("color")
+        colors = None if own is None else _unit(np.asarray(own))[:, :3][faces]
         if uv is None and material.image is not None and np.ptp(material.image, (0, 1)).any():
             raise UserError(f"{path}: faces without texture coordinates have a picture")
     elif visual is not None and visual.kind == "vertex":
@@ -177,6 +169,9 @@ def _from_trimesh(mesh: trimesh.Trimesh, path: Path) -> RawMesh:
     elif visual is not None and visual.kind == "face":
         colors = np.asarray(visual.face_colors)[:, None, :3].repeat(3, axis=1) / 255
         material = Material(np.ones(3), None)
+    if linear and material is not PLAIN:
+        material = material._replace(color=_encode_srgb(material.color))
+        colors = None if colors is None else _encode_srgb(colors)
     # set by trimesh's readers only where the file has normals
     given = mesh._cache.cache.get("vertex_normals")
     normals = None if given is None else np.asarray(given)[faces]
@@ -189,6 +184,18 @@ def _from_trimesh(mesh: trimesh.Trimesh, path: Path) -> RawMesh:
         np.zeros(len(faces), dtype=np.int64),
         [material],
     )
+
+
+def _unit(colors: np.ndarray) -> np.ndarray:
+    """Return colors in [0, 1], as numbers of 8 or 16 bits may stand for them."""
+    most = np.iinfo(colors.dtype).max if np.issubdtype(colors.dtype, np.integer) else 1.0
+    return (colors.astype(np.float64) / most).clip(0, 1)
+
+
+def _encode_srgb(linear: np.ndarray) -> np.ndarray:
+    """Return colors as pictures have them.  In [0, 1], of any shape."""
+    high = 1.055 * np.maximum(linear, 0.0031308) ** (1 / 2.4) - 0.055
+    return np.where(linear <= 0.0031308, 12.92 * linear, high)
 
 
 def _trimesh_material(material: object) -> Material:

@@ -6,14 +6,21 @@ from typing import NamedTuple
 import numpy as np
 
 from posefilter.errors import UserError
-from posefilter.meshes.mesh import Mesh, diameter, face_areas, surface_colors
+from posefilter.meshes.mesh import (
+    OPEN_EDGES,
+    Mesh,
+    diameter,
+    face_areas,
+    find_open_edges,
+    measure_volume,
+    surface_colors,
+)
 
 # [m] across: what is larger or smaller is likely in another unit than meters
 LARGEST, SMALLEST = 2.0, 0.01
 _COMMON = 0.2  # [m] likely units are told in the order of how near they come to it
 _UNITS = {"centimeters": 0.01, "millimeters": 0.001, "inches": 0.0254}
 _COARSE = 0.5  # [px / mm] of texture
-_OPEN = 0.01  # share of edges that belong to one face
 
 
 class MeshFacts(NamedTuple):
@@ -24,7 +31,7 @@ class MeshFacts(NamedTuple):
         size_mm: Of the box along the file's axes.
         faces: Number of triangles.
         open_edges: Share of the edges that do not belong to two triangles.
-        volume_cm3: Of a closed surface; negative where its faces look inward.
+        volume_cm3: Of a closed surface.
         texture_px_per_mm: Of the texture on the surface; 0 without texture.
         colored: Whether texture or vertices have more than one color.
     """
@@ -41,12 +48,6 @@ class MeshFacts(NamedTuple):
 def inspect_mesh(mesh: Mesh) -> MeshFacts:
     """Measure a mesh."""
     low, high = mesh.bounds
-    _, weld = np.unique(np.round(mesh.vertices, 7), axis=0, return_inverse=True)
-    faces = weld.reshape(-1)[mesh.faces]
-    edges = np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
-    count = np.unique(edges, axis=0, return_counts=True)[1]
-    a, b, c = (mesh.vertices[mesh.faces[:, i]] - (low + high) / 2 for i in range(3))
-    volume = float((a * np.cross(b, c)).sum() / 6)
     resolution = 0.0
     if mesh.corner_uv is not None and max(mesh.texture.shape[:2]) > 1:
         size = np.array(mesh.texture.shape[1::-1])
@@ -66,8 +67,8 @@ def inspect_mesh(mesh: Mesh) -> MeshFacts:
         1000 * diameter(mesh.vertices),
         (x, y, z),
         len(mesh.faces),
-        float((count != 2).mean()),
-        1e6 * volume,
+        find_open_edges(mesh.vertices, mesh.faces),
+        1e6 * measure_volume(mesh.vertices, mesh.faces),
         resolution,
         printed or painted or several,
     )
@@ -96,14 +97,12 @@ def check_size(facts: MeshFacts, source: str) -> None:
 def list_concerns(facts: MeshFacts) -> list[str]:
     """Return what may spoil renders of a mesh, a sentence each."""
     out = []
-    if facts.open_edges > _OPEN:
+    if facts.open_edges > OPEN_EDGES:
         share = 100 * facts.open_edges
         out.append(
             f"The surface is not closed ({share:.0f} % of its edges belong to one face): renders "
             "may show its inside."
         )
-    elif facts.volume_cm3 < 0:
-        out.append("The faces look inward: renders are lit from the wrong side.")
     if not facts.colored:
         out.append("It has one color: what is printed on the real object is not learned.")
     elif 0 < facts.texture_px_per_mm < _COARSE:

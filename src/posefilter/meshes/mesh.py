@@ -6,18 +6,21 @@ from functools import cached_property
 
 import numpy as np
 import torch
-from scipy.spatial import ConvexHull, QhullError
-from scipy.spatial.distance import pdist
+from scipy.spatial import ConvexHull, QhullError, cKDTree
+from scipy.spatial.distance import cdist
 
 from posefilter.errors import UserError
 from posefilter.types import ObjectModel
 
 _CREASE = np.cos(np.deg2rad(40.0))  # faces that meet at more than this share no normal
+OPEN_EDGES = 0.01  # share of a surface's edges; one with more is not closed
 _MOST_PAIRS = 4e8  # of faces that meet
 _CHUNK = 1 << 24  # of such pairs at once
 _HULL_VERTICES = 128
 _HULL_DIRECTIONS = 5000  # some 2.9 degrees apart
 _HULL_ERROR = 2.5e-4  # [m] stop refining the outline hull here
+_MOST_HULL = 20_000  # vertices of a hull that are looked at: a smooth scan has more
+_PAIRS = 1 << 24  # distances, or reaches, at once
 _PART_POINTS = 300  # of a part's surface, beside the vertices of its hull
 # how the names of distractors begin that are made for one set of rendered scenes: no file has them
 LOOKALIKE = "lookalike_"
@@ -58,6 +61,30 @@ def face_areas(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     """Return the area of each triangle.  (V, 3) [m], (F, 3) -> (F,) [m^2]."""
     a, b, c = (vertices[faces[:, i]] for i in range(3))
     return 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)
+
+
+def find_open_edges(vertices: np.ndarray, faces: np.ndarray) -> float:
+    """Return the share of edges that do not belong to two triangles.  (V, 3) [m], (F, 3)."""
+    _, weld = np.unique(np.round(vertices, 7), axis=0, return_inverse=True)
+    welded = weld.reshape(-1)[faces]
+    edges = np.sort(welded[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
+    return float((np.unique(edges, axis=0, return_counts=True)[1] != 2).mean())
+
+
+def measure_volume(vertices: np.ndarray, faces: np.ndarray) -> float:
+    """Return what a closed surface contains; negative where its faces look inward.
+
+    (V, 3) [m], (F, 3) -> [m^3].
+    """
+    center = (vertices.min(0) + vertices.max(0)) / 2
+    a, b, c = (vertices[faces[:, i]] - center for i in range(3))
+    return float((a * np.cross(b, c)).sum() / 6)
+
+
+def looks_inward(vertices: np.ndarray, faces: np.ndarray) -> bool:
+    """Return whether a surface is closed, with its faces looking inward.  (V, 3) [m], (F, 3)."""
+    inward = measure_volume(vertices, faces) < 0
+    return inward and find_open_edges(vertices, faces) <= OPEN_EDGES
 
 
 def creased_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
@@ -207,6 +234,8 @@ def outline_hull(
     """
     full = hull_vertices(vertices)
     directions = sphere_directions(_HULL_DIRECTIONS)
+    if len(full) > _MOST_HULL:
+        full = full[_find_outermost(full, directions)]
     reach = full.astype(np.float32) @ directions.T.astype(np.float32)  # (H, D)
     target, best = reach.max(axis=0), reach.argmax(axis=0)
     chosen = list(
@@ -230,12 +259,45 @@ def sphere_directions(count: int) -> np.ndarray:
     return np.stack([flat * np.cos(angle), flat * np.sin(angle), z], axis=1)
 
 
+def _find_outermost(points: np.ndarray, directions: np.ndarray) -> np.ndarray:
+    """Return which points are the outermost in any direction, along the axes too.
+
+    (V, 3), (D, 3) -> (N,) indices.
+    """
+    both = np.concatenate([directions, np.eye(3), -np.eye(3)]).astype(np.float32)
+    some = np.array_split(both, -(-len(both) * len(points) // _PAIRS))
+    return np.unique(np.concatenate([(points.astype(np.float32) @ d.T).argmax(0) for d in some]))
+
+
 def diameter(vertices: np.ndarray) -> float:
     """Return the largest distance between two vertices, exactly (over the hull's).
 
     (V, 3) [m] -> [m].
     """
-    return float(pdist(hull_vertices(vertices)).max())
+    hull = hull_vertices(vertices)
+    center = (hull.min(0) + hull.max(0)) / 2
+    radius = np.linalg.norm(hull - center, axis=1)
+    far = hull[radius.argmax()]
+    for _ in range(3):  # from the outermost vertex to the farthest from it, and so on
+        distance = np.linalg.norm(hull - far, axis=1)
+        far = hull[distance.argmax()]
+    least, most = (1 - 1e-9) * distance.max(), radius.max()
+    hull, radius = (part[radius >= least - most] for part in (hull, radius))
+    if len(hull) ** 2 <= _PAIRS:
+        return float(cdist(hull, hull).max())
+    # what is farther than that from a vertex lies in a cap round the opposite of it: of a ball's
+    # vertices few
+    cosine = (least**2 - radius**2 - most**2) / (2 * radius * most)
+    cap = (1 + 1e-6) * most * np.sqrt((2 - 2 * cosine).clip(0)) + 1e-9 * most
+    opposite = center - (hull - center) * (most / radius)[:, None]
+    tree = cKDTree(hull)
+    best = 0.0
+    for some in np.array_split(np.arange(len(hull)), -(-(len(hull) ** 2) // _PAIRS)):
+        near = tree.query_ball_point(opposite[some], cap[some])
+        start = np.repeat(some, [len(one) for one in near])
+        end = np.concatenate([np.asarray(one, int) for one in near])
+        best = max(best, np.linalg.norm(hull[start] - hull[end], axis=1).max(initial=0.0))
+    return float(best)
 
 
 def object_model(

@@ -9,6 +9,7 @@ import numpy as np
 
 from posefilter.errors import UserError
 from posefilter.limits import check_picture, read_bytes
+from posefilter.meshes.polygons import triangulate
 from posefilter.paths import check_inside
 
 
@@ -94,10 +95,11 @@ def _read_mtl(path: Path, source: Path, images: dict[Path, np.ndarray]) -> dict[
 
 
 def read_obj(path: Path) -> RawMesh:
-    """Parse Wavefront OBJ: v (with colors), vt, vn, f (any polygon, as a fan), mtllib, usemtl."""
+    """Parse Wavefront OBJ: v (with colors), vt, vn, f (any polygon), mtllib, usemtl."""
     numbers: dict[str, list[list[float]]] = {"v": [], "vt": [], "vn": []}
     corners: list[tuple[int, int, int]] = []
     face_material: list[int] = []
+    polygons: dict[int, list[int]] = {}  # by number of corners: the first triangle of each
     library: dict[str, Material] = {}
     images: dict[Path, np.ndarray] = {}
     materials: dict[str, int] = {}
@@ -107,6 +109,8 @@ def read_obj(path: Path) -> RawMesh:
             numbers[key].append([float(x) for x in rest.split()])
         elif key == "f":
             polygon = [_corner(word, numbers) for word in rest.split()]
+            if len(polygon) > 3:
+                polygons.setdefault(len(polygon), []).append(len(face_material))
             for i in range(1, len(polygon) - 1):
                 corners += [polygon[0], polygon[i], polygon[i + 1]]
                 face_material.append(current)
@@ -133,6 +137,8 @@ def read_obj(path: Path) -> RawMesh:
     faces = index[..., 0]
     if len(faces) and (faces.min() < 0 or faces.max() >= len(vertices)):
         raise UserError(f"{path}: a face names a vertex that is not there (is the file cut short?)")
+    for count, firsts in polygons.items():
+        _split(index, vertices, np.array(firsts), count)
     return RawMesh(
         vertices,
         faces,
@@ -142,6 +148,21 @@ def read_obj(path: Path) -> RawMesh:
         np.array(face_material, dtype=np.int64),
         known,
     )
+
+
+def _split(index: np.ndarray, vertices: np.ndarray, firsts: np.ndarray, count: int) -> None:
+    """Split polygons, which are fans so far, such that concave ones are covered, too; in place.
+
+    Args:
+        index: (F, 3, 3) of each triangle's corners: vertex, texture coordinates, normal.
+        vertices: (V, 3).
+        firsts: (M,) the first triangle of each polygon.
+        count: Corners of each.
+    """
+    rows = firsts[:, None] + np.arange(count - 2)  # (M, n - 2)
+    corners = np.concatenate([index[firsts, :2], index[rows, 2]], axis=1)  # (M, n, 3)
+    triangles = triangulate(vertices[corners[..., 0]])
+    index[rows] = corners[np.arange(len(firsts))[:, None, None], triangles]
 
 
 def _read_lines(path: Path) -> Iterator[tuple[str, str]]:

@@ -1,4 +1,4 @@
-"""What the header of a PLY file says of colors and texture, put so that trimesh reads it."""
+"""A PLY file's header, put such that trimesh finds colors and texture; and mixed polygons split."""
 
 import io
 import re
@@ -6,6 +6,7 @@ from pathlib import Path
 
 from posefilter.errors import UserError
 from posefilter.limits import read_bytes
+from posefilter.meshes.ply_faces import split_faces
 
 _END = b"end_header"
 _LONGEST = 1 << 20  # of a header [bytes]
@@ -16,7 +17,7 @@ _COORDINATES = ("texture_u", "texture_v", "u", "v", "s", "t", "texcoord")
 
 def open_ply(path: Path) -> tuple[io.BytesIO, list[str]]:
     """Open a PLY file for trimesh, which looks for colors under one name alone, and not at all
-    where there are texture coordinates.
+    where there are texture coordinates, and takes a binary file's faces to be all of one size.
 
     A mesh with both a texture and colors has its texture, as BOP's models of YCB-Video have both.
 
@@ -51,4 +52,5 @@ def open_ply(path: Path) -> tuple[io.BytesIO, list[str]]:
         header = _PROPERTY.sub(
             lambda m: m[1] + ("unused_" if m[2] in _COORDINATES else "") + m[2] + m[3], header
         )
-    return io.BytesIO(header.encode("latin-1") + data[end:]), textures
+    header, body = split_faces(header, data[end:])
+    return io.BytesIO(header.encode("latin-1") + body), textures

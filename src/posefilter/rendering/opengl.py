@@ -49,7 +49,13 @@ class _Uploaded:
     """A mesh on the device."""
 
     mesh: Mesh | Plane
+    buffer: Any
     array: Any
+
+    def release(self) -> None:
+        """Free its memory there: an array does not free the buffer that it reads."""
+        self.array.release()
+        self.buffer.release()
 
 
 class GLRenderer(Renderer):
@@ -169,10 +175,11 @@ class GLRenderer(Renderer):
         key = id(shape)
         if key not in self._arrays:
             while len(self._arrays) >= _KEPT:
-                self._arrays.pop(next(iter(self._arrays))).array.release()
+                self._arrays.pop(next(iter(self._arrays))).release()
             buffer = self._gl.buffer(vertices(shape).astype("f4").tobytes())
             layout = [(buffer, "3f 3f 2f 3f", "position", "normal", "uv", "color")]
-            self._arrays[key] = _Uploaded(shape, self._gl.vertex_array(self._program, layout))
+            array = self._gl.vertex_array(self._program, layout)
+            self._arrays[key] = _Uploaded(shape, buffer, array)
         self._program["camera_from_object"].write(pose.T.astype("f4").tobytes())
         self._program["normal_matrix"].write(normal_matrix.T.astype("f4").tobytes())
         self._program["index"].value = float(index)

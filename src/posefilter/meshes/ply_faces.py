@@ -1,0 +1,146 @@
+"""Binary PLY files with faces of several sizes, as modeling tools write them."""
+
+import re
+import struct
+from collections.abc import Iterator, Mapping
+from typing import NamedTuple
+
+import numpy as np
+
+from posefilter.meshes.polygons import triangulate
+
+_ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">"}
+# kinds of numbers, as `struct` and numpy name them
+_KINDS = {
+    **dict.fromkeys(("char", "int8"), "b"),
+    **dict.fromkeys(("uchar", "uint8"), "B"),
+    **dict.fromkeys(("short", "int16"), "h"),
+    **dict.fromkeys(("ushort", "uint16"), "H"),
+    **dict.fromkeys(("int", "int32"), "i"),
+    **dict.fromkeys(("uint", "uint32"), "I"),
+    **dict.fromkeys(("float", "float32"), "f"),
+    **dict.fromkeys(("double", "float64"), "d"),
+}
+_CORNERS = ("vertex_indices", "vertex_index")
+_FIRST = ["vertex", "face"]  # the elements of a mesh
+
+
+class _Property(NamedTuple):
+    """A number, or a list, that each row of an element has."""
+
+    name: str
+    kind: str
+    length: str | None  # the kind of a list's length; None: a number
+
+
+class _Element(NamedTuple):
+    """A kind of rows: vertices, faces."""
+
+    name: str
+    rows: int
+    properties: list[_Property]
+
+
+_Row = Mapping[str, tuple[float, ...]]  # by property
+
+
+def split_faces(header: str, body: bytes) -> tuple[str, bytes]:
+    """Split the faces of a binary file into triangles, where they are of several sizes.
+
+    Args:
+        header: Of a PLY file, up to its last line.
+        body: The rest.
+
+    Returns:
+        Both, changed; as they are where all faces are of one size, or the file is a text.
+
+    Raises:
+        ValueError, struct.error: The file is cut short or broken.
+    """
+    form = re.search(r"^format\s+(\w+)", header, re.MULTILINE)
+    elements = list(_list_elements(header))
+    if form is None or form[1] not in _ORDERS or [e.name for e in elements[:2]] != _FIRST:
+        return header, body
+    vertex, face = elements[:2]
+    corners = next((p.name for p in face.properties if p.name in _CORNERS and p.length), None)
+    if corners is None or any(p.length for p in vertex.properties):
+        return header, body
+    order = _ORDERS[form[1]]
+    row = np.dtype([(p.name, order + p.kind) for p in vertex.properties])
+    first = body.index(b"\n") + 1
+    start = first + vertex.rows * row.itemsize
+    rows, stop = _read_rows(body, start, face, order)
+    sizes = np.array([len(one[corners]) for one in rows])
+    if len(set(sizes.tolist())) < 2:
+        return header, body
+    table = np.frombuffer(body, row, vertex.rows, first)
+    vertices = np.stack([table[axis] for axis in "xyz"], axis=1).astype(np.float64)
+    triangles = {}
+    for size in set(sizes.tolist()) - {0, 1, 2}:
+        places = np.array([one[corners] for one in rows if len(one[corners]) == size], int)
+        triangles[size] = iter(triangulate(vertices[places]))
+    out = [
+        _take(one, triangle, len(one[corners]))
+        for one in rows
+        if len(one[corners]) > 2
+        for triangle in next(triangles[len(one[corners])]).tolist()
+    ]
+    packed = b"".join(_pack(one, face, order) for one in out)
+    header = re.sub(r"^(\s*element\s+face\s+)\d+", rf"\g<1>{len(out)}", header, flags=re.MULTILINE)
+    return header, body[:start] + packed + body[stop:]
+
+
+def _list_elements(header: str) -> Iterator[_Element]:
+    for line in header.splitlines():
+        match line.split():
+            case ["element", name, count]:
+                element = _Element(name, int(count), [])
+                yield element
+            case ["property", "list", count, kind, name]:
+                element.properties.append(_Property(name, _KINDS[kind], _KINDS[count]))
+            case ["property", kind, name]:
+                element.properties.append(_Property(name, _KINDS[kind], None))
+
+
+def _read_rows(body: bytes, at: int, element: _Element, order: str) -> tuple[list[_Row], int]:
+    """Return an element's rows, and where what comes after them begins."""
+    rows: list[_Row] = []
+    for _ in range(element.rows):
+        row: dict[str, tuple[float, ...]] = {}
+        for name, kind, length in element.properties:
+            number = 1
+            if length is not None:
+                (number,) = struct.unpack_from(order + length, body, at)
+                at += struct.calcsize(length)
+            form = f"{order}{number}{kind}"
+            row[name] = struct.unpack_from(form, body, at)
+            at += struct.calcsize(form)
+        rows.append(row)
+    return rows, at
+
+
+def _take(row: _Row, triangle: list[int], size: int) -> _Row:
+    """Return a face's row for one of its triangles.
+
+    Args:
+        row: Of a polygon.
+        triangle: Which of its corners.
+        size: How many it has.
+    """
+    out = {}
+    for name, values in row.items():
+        width = len(values) // size if len(values) % size == 0 else 0
+        # corners, and what each of them has, such as texture coordinates
+        own = [values[width * corner + i] for corner in triangle for i in range(width)]
+        out[name] = tuple(own) if width else values
+    return out
+
+
+def _pack(row: _Row, element: _Element, order: str) -> bytes:
+    out = b""
+    for name, kind, length in element.properties:
+        values = row[name]
+        if length is not None:
+            out += struct.pack(order + length, len(values))
+        out += struct.pack(f"{order}{len(values)}{kind}", *values)
+    return out
