@@ -48,11 +48,21 @@ def test_a_plain_state_passes_unchanged() -> None:
 
 def test_surface_points_come_back_to_a_ten_thousandth_and_the_rest_as_it_was() -> None:
     points = 0.1 * torch.randn(500, 3)
-    plain = {**square()._asdict(), "points": points, "texture": torch.rand(7, 9)}
+    texture = torch.rand(700, 9)
+    texture[:, 3:6] = torch.nn.functional.normalize(torch.randn(700, 3), dim=1)
+    plain = {**square()._asdict(), "points": points, "texture": texture}
     packed = pack_object(plain)
     assert packed["points"].dtype == packed["texture"].dtype == torch.float16
     after = unpack_object(packed)
     assert after.points.dtype == torch.float32
     assert (after.points - points).abs().max() < 5e-4 * points.abs().max()
     assert torch.equal(after.hull, plain["hull"])
+    assert after.texture is not None
+    error = (after.texture.float() - texture).abs()
+    assert error[:, :3].max() < 5e-4
+    assert error[:, 3:6].max() < 1 / 127
+    assert error[:, 6:].max() < 0.51 / 255 + 3e-4
+    again = unpack_object(pack_object(after._asdict()))
+    assert again.texture is not None
+    assert torch.equal(again.texture[:, 6:], after.texture[:, 6:])
     assert pack_object({**plain, "texture": None})["texture"] is None

@@ -205,6 +205,13 @@ CHANGES: dict[str, Callable[[dict[str, Any]], None]] = {
     "a texture that is not finite": update("object_model", texture=torch.full((5, 9), torch.nan)),
     "a texture of negative colors": update("object_model", texture=-torch.ones(5, 9)),
     "30,000 textured points": update("object_model", texture=torch.zeros(30_000, 9)),
+    "bytes of no texture": update("object_model", texture_look=torch.zeros(5, 6).byte()),
+    "bytes of another texture": update(
+        "object_model", texture=torch.zeros(5, 3), texture_look=torch.zeros(4, 6).byte()
+    ),
+    "bytes beside a whole texture": update(
+        "object_model", texture=torch.zeros(5, 9), texture_look=torch.zeros(5, 6).byte()
+    ),
     "no hull": update("object_model", hull=None),
     "no symmetry": update("object_model", symmetries=torch.zeros(0, 4, 4)),
     "points at the end of numbers": update("object_model", points=torch.full((5, 3), 3e38)),

@@ -132,8 +132,9 @@ def check_tensor(value: Tensor, size: int, said: str) -> None:
 def _check_object(model: Any, said: str) -> None:
     shapes = {"points": (-1, 3), "center": (3,), "symmetries": (-1, 4, 4), "hull": (-1, 3)}
     # checkpoints of earlier versions have none of these
-    later = {"texture": (-1, 9), "shape_symmetries": (-1, 4, 4)}
-    if not isinstance(model, dict) or set(model) - {"parts", *later} != {
+    packed = isinstance(model, dict) and model.get("texture_look") is not None
+    later = {"texture": (-1, 3 if packed else 9), "shape_symmetries": (-1, 4, 4)}
+    if not isinstance(model, dict) or set(model) - {"parts", "texture_look", *later} != {
         "name",
         "radius",
         "diameter",
@@ -171,7 +172,14 @@ def _check_object(model: Any, said: str) -> None:
     for key in held:
         if key.endswith("symmetries") and not is_rigid(held[key].double()):
             raise UserError(f"{said}: its object's {key} should be turns, each with a shift")
-    colors = held["texture"][:, 6:] if "texture" in held else torch.zeros(1)
+    if packed:
+        look, count = model["texture_look"], len(held["texture"]) if "texture" in held else -1
+        fits = isinstance(look, Tensor) and look.dtype == torch.uint8
+        if not (fits and look.shape == (count, 6)):
+            raise UserError(
+                f"{said}: its object's texture_look should be 6 bytes for each of its points"
+            )
+    colors = held["texture"][:, 6:] if "texture" in held and not packed else torch.zeros(1)
     if not bool(((colors >= 0) & (colors <= 1)).all()):
         raise UserError(f"{said}: its object's texture should have colors in [0, 1]")
     for key in ("radius", "diameter"):
