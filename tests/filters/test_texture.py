@@ -1,5 +1,7 @@
 """The print decides the turns that a shape leaves open, and says nothing where there is none."""
 
+import gc
+import weakref
 from types import SimpleNamespace
 
 import numpy as np
@@ -94,6 +96,21 @@ def test_a_coarser_print_has_the_mean_colors_around_its_points_and_none_through_
     assert coarse[:, 0].quantile(0.5) == pytest.approx(0.1, abs=0.01)
     assert coarse[:, 8].std() < 0.5 * noise.std()  # of some ten
     assert coarse[:, 8].mean() == pytest.approx(float(noise.mean()), abs=0.03)
+
+
+def test_a_coarser_texture_is_made_once_and_not_kept_for_ever() -> None:
+    model = load("carton")
+    assert model.texture is not None
+    own = model._replace(texture=model.texture.repeat(2, 1))
+    first, other = (coarsen_texture(own, most).texture for most in (100, 50))
+    assert first is not None
+    assert other is not None
+    assert coarsen_texture(own._replace(name="other"), 100).texture is first
+    assert len(other) == 50
+    kept = weakref.ref(first)
+    del first, own
+    gc.collect()
+    assert kept() is None
 
 
 def test_a_plain_object_says_nothing() -> None:

@@ -4,11 +4,13 @@ A learned likelihood and the depth hardly tell the turns of a can apart, where o
 Here the colors that the mesh has are compared with those that the image shows, without learning.
 """
 
+from collections.abc import MutableMapping
 from typing import ClassVar, NamedTuple
 
 import torch
 import torch.nn.functional as F
 from torch import Generator, Tensor
+from torch.utils.weak import WeakIdKeyDictionary
 
 from posefilter.capabilities import Capabilities
 from posefilter.errors import UserError
@@ -40,6 +42,10 @@ _MISSING = (
     "choose filter/refine=mean_shift_icp, or train again"
 )
 _OWN = 0.2  # [diameters] a particle that is farther from every turn is of another place
+
+
+# the coarser textures of objects' textures, by number of points: as long as those are there
+_COARSENED: MutableMapping[Tensor, dict[int, Tensor]] = WeakIdKeyDictionary()
 
 
 class Print(NamedTuple):
@@ -103,17 +109,33 @@ def coarsen_texture(object_model: ObjectModel, most: int = _COARSE) -> ObjectMod
     texture = object_model.texture
     if texture is None or len(texture) <= most:
         return object_model
-    # a point on the other side of a thin wall is not near
-    side = _WALL * object_model.diameter
+    kept = _COARSENED.setdefault(texture, {})
+    if most not in kept:
+        # a point on the other side of a thin wall is not near
+        kept[most] = _average(texture, most, _WALL * object_model.diameter)
+    return object_model._replace(texture=kept[most])
+
+
+def _average(texture: Tensor, most: int, side: float) -> Tensor:
+    """Return some textured points, each with the mean color of those nearest to it.
+
+    Args:
+        texture: (P, 9) point, normal, color.
+        most: How many.
+        side: By which opposite sides of the surface count as apart [m].
+
+    Returns:
+        (most, 9).
+    """
     places = torch.cat([texture[:, :3], side * texture[:, 3:6]], dim=1).float()
     # every so many: points are drawn face by face, and the first ones are of some faces alone
-    kept = torch.arange(most, device=texture.device) * len(texture) // most
-    nearest = torch.cdist(places, places[kept]).argmin(1)
+    chosen = torch.arange(most, device=texture.device) * len(texture) // most
+    nearest = torch.cdist(places, places[chosen]).argmin(1)
     total = places.new_zeros(most, 4).index_add(
         0, nearest, torch.cat([texture[:, 6:].float(), places.new_ones(len(texture), 1)], dim=1)
     )
-    coarse = torch.cat([texture[kept, :6].float(), total[:, :3] / total[:, 3:]], dim=1)
-    return object_model._replace(texture=coarse.to(texture.dtype))
+    coarse = torch.cat([texture[chosen, :6].float(), total[:, :3] / total[:, 3:]], dim=1)
+    return coarse.to(texture.dtype)
 
 
 def _compare(
