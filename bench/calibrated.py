@@ -22,7 +22,7 @@ the share of its surface points that the frame holds, since the frame cuts many 
 that of conformal and of credible sets.  In the band: the share of the true outline's points, of the
 hull, that lie in the 95 % band of the belief (`Result.draw_band`).  The last table is of frames
 whose estimate is right: ellipsoids are of the belief's covariance about the estimate, in the shape
-of Student's t with 5 degrees of freedom.
+of Student's t.
 """
 
 import argparse
@@ -38,11 +38,12 @@ import cv2
 import numpy as np
 import torch
 from checkpoint_frames import open_frames
-from confidence import measure_error, read_tolerance
+from confidence import degrees_of, measure_error, read_tolerance
 from scipy.stats import kstest
 
 from posefilter.belief import Belief
 from posefilter.cli.checkpoints import method_of, read_checkpoint
+from posefilter.confidence.belief_scale import DEGREES
 from posefilter.confidence.fit import Frames, fit_calibration
 from posefilter.confidence.tolerance import RIGHT, PoseErrors, PoseTolerance, measure_pose_errors
 from posefilter.data.absent import hide_annotation
@@ -180,7 +181,8 @@ def look(method: PoseEstimator, found: Observation, there: bool) -> Iterator[Row
                 row[f"{which}rank"] = float(scores.rank[i])
                 row[f"{which}log_density"] = float(scores.log_density[i])
                 estimate = of.best[i].double().numpy()
-                error = measure_error(own, estimate, truth)
+                degrees = degrees_of(method) if of is belief else DEGREES
+                error = measure_error(own, estimate, truth, degrees)
                 row |= {f"{which}{key}": value for key, value in error.items()}
                 row[f"{which}band"] = measure_band(own, truth, hull, K, found.size)
         yield row

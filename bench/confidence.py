@@ -27,6 +27,7 @@ from scipy.stats import f as f_distribution
 
 import posefilter
 from posefilter.belief import Belief
+from posefilter.confidence.belief_scale import DEGREES
 from posefilter.confidence.tolerance import RIGHT, PoseTolerance, measure_pose_errors
 from posefilter.data.frames import FrameRecord, Sample
 from posefilter.data.readers.base import BaseReader
@@ -34,6 +35,7 @@ from posefilter.data.readers.registry import open_meshes, open_reader
 from posefilter.errors import UserError
 from posefilter.geometry.pose_statistics import twist_between
 from posefilter.metrics.credibility import SHOWN
+from posefilter.models.base import PoseEstimator
 from posefilter.result import Result
 
 Inputs = tuple[np.ndarray, np.ndarray, np.ndarray]
@@ -96,6 +98,12 @@ def list_images(reader: BaseReader, every: int) -> list[list[int]]:
     return [own for many in scenes.values() for own in many[::every]]
 
 
+def degrees_of(method: PoseEstimator) -> int:
+    """Return the degrees of freedom of a method's calibrated beliefs."""
+    scale = None if method.calibration is None else method.calibration.belief_scale
+    return DEGREES if scale is None else scale.degrees
+
+
 def is_right_pose(result: Result, truth: np.ndarray) -> bool:
     """Return whether a pose keeps the tolerance that was asked for, else 0.1 diameters (ADD);
     truth (4, 4).
@@ -105,14 +113,22 @@ def is_right_pose(result: Result, truth: np.ndarray) -> bool:
     return bool((result.pose_tolerance or RIGHT).accepts(errors))
 
 
-def measure_error(belief: Belief, estimate: np.ndarray, truth: np.ndarray) -> dict[str, Any]:
+def measure_error(
+    belief: Belief, estimate: np.ndarray, truth: np.ndarray, degrees: int = DEGREES
+) -> dict[str, Any]:
     """Return how far an estimate is off, and what its belief says of that.
+
+    Args:
+        belief: About the estimate.
+        estimate: (4, 4).
+        truth: (4, 4).
+        degrees: Of freedom, of the calibrated belief (`BeliefScale`).
 
     Returns:
         off: Translation of the center [m] and rotation [rad].  says: What `Belief.uncertainty`
         gives for them at 95 %.  within: Whether each is within it.  level: Of the smallest
         ellipsoid that holds the truth, of the covariance about the estimate and in the shape of
-        Student's t with 5 degrees of freedom.
+        Student's t.
     """
     lone = replace(belief, samples=truth[None], weights=np.ones(1), draws=0)
     near = lone.canonicalize(estimate)
@@ -124,8 +140,8 @@ def measure_error(belief: Belief, estimate: np.ndarray, truth: np.ndarray) -> di
     off = [float(np.linalg.norm(error[:3])), float(np.linalg.norm(error[3:]))]
     says = [sure.translation, sure.rotation]
     within = [one <= most for one, most in zip(off, says, strict=True)]
-    # the covariance is 5 / 3 times the distribution's scale
-    level = float(f_distribution.cdf(squared * 5 / 3 / 6, 6, 5))
+    # the covariance is n / (n - 2) times the distribution's scale
+    level = float(f_distribution.cdf(squared * degrees / (degrees - 2) / 6, 6, degrees))
     return {"off": off, "says": says, "within": within, "level": level}
 
 
@@ -187,7 +203,8 @@ def look(
                 sample = there[result.object]
                 truth = sample.camera_from_object.astype(np.float64)
                 row["right"] = is_right_pose(result, truth)
-                row |= measure_error(result.belief, result.pose, truth)
+                degrees = degrees_of(estimator.methods[estimator.objects.index(result.object)])
+                row |= measure_error(result.belief, result.pose, truth, degrees)
             rows.append(row)
             print(json.dumps(row), flush=True)
     return rows

@@ -26,7 +26,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from confidence import measure_error, summarize_errors
+from confidence import degrees_of, measure_error, summarize_errors
 
 import posefilter
 from posefilter.data.frames import FrameRecord, Sample
@@ -83,7 +83,10 @@ def judge(
     _, one = take_time(lambda: estimator.predict(*image, seed=seed))
     truths = [s.camera_from_object.astype(np.float64) for s in samples]
     pairs = match_greedily(measure_errors(results, truths), 0.1)
-    beliefs = [measure_error(results[r].belief, results[r].pose, truths[t]) for r, t in pairs]
+    degrees = degrees_of(estimator.methods[0])
+    beliefs = [
+        measure_error(results[r].belief, results[r].pose, truths[t], degrees) for r, t in pairs
+    ]
     overlap = sum(one.mask.astype(int) for one in results).max() if results else 0
     return {
         "instances": wanted,

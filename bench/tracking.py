@@ -34,7 +34,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from confidence import is_right_pose, measure_error, summarize_errors
+from confidence import degrees_of, is_right_pose, measure_error, summarize_errors
 from marked import put_table, read_rows
 
 import posefilter
@@ -411,8 +411,9 @@ def measure_beliefs(
                 weights=weights[0].double().cpu().numpy(),
                 draws=0,
             )
-            for name, belief in (("calibrated", result.belief), ("particles", particles)):
-                rows[name].append(measure_error(belief, result.pose, truth))
+            degrees = degrees_of(track.method)
+            rows["calibrated"].append(measure_error(result.belief, result.pose, truth, degrees))
+            rows["particles"].append(measure_error(particles, result.pose, truth))
     return rows
 
 

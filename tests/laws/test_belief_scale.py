@@ -148,19 +148,41 @@ def test_no_frame_is_judged_by_a_scale_that_has_seen_it() -> None:
     assert a[0] != b[0]
 
 
-def test_draws_have_the_moments_of_the_distribution_and_are_always_the_same() -> None:
+@pytest.mark.parametrize(("degrees", "most"), [(3, 8.94), (5, 4.95), (8, 3.58)])  # F(6, n) at 95 %
+def test_draws_have_the_moments_of_the_distribution_and_are_always_the_same(
+    degrees: int, most: float
+) -> None:
+    moment = torch.eye(6, dtype=torch.float64) * degrees / (degrees - 2)
     for count in (32, 200, 201):
-        draws = draw_student_t(count)
+        draws = draw_student_t(count, degrees)
         assert draws.shape == (count, 6)
-        assert torch.allclose(
-            draws.mT @ draws / count, torch.eye(6, dtype=torch.float64) * 5 / 3, atol=1e-9
-        )
-        assert torch.equal(draws, draw_student_t(count))
-    half = draw_student_t(200)
+        assert torch.allclose(draws.mT @ draws / count, moment, atol=1e-9)
+        assert torch.equal(draws, draw_student_t(count, degrees))
+    half = draw_student_t(200, degrees)
     assert torch.equal(half[::2], -half[1::2])
-    tail = draw_student_t(20_000).square().sum(1)
-    # P(F(6, 5) < 4.95) = 0.95
-    assert float((tail < 6 * 4.95).double().mean()) == pytest.approx(0.95, abs=0.01)
+    tail = draw_student_t(200, degrees).square().sum(1)
+    assert float((tail < 6 * most).double().mean()) == pytest.approx(0.95, abs=0.035)
+
+
+@pytest.mark.parametrize("degrees", [3, 5, 8])
+def test_the_degrees_of_freedom_are_found(degrees: int) -> None:
+    """Also that few frames leave the usual ones."""
+    generator = torch.Generator().manual_seed(degrees)
+    normal = torch.randn(2000, 6, generator=generator, dtype=torch.float64)
+    squares = torch.randn(2000, degrees, generator=generator, dtype=torch.float64).square()
+    twist = 0.5 * normal * (degrees / squares.sum(1, keepdim=True)).sqrt()
+    scatter = torch.eye(6, dtype=torch.float64).expand(2000, 6, 6)
+    probability = torch.full((2000,), 0.9)
+    for count, want in ((2000, degrees), (15, 5)):
+        spread = PoseSpread(twist[:count], scatter[:count])
+        found = fit_belief_scale(spread, probability[:count], bare(probability[:count]))
+        assert found is not None
+        assert found.degrees == want
+    factor = fit_belief_scale(PoseSpread(twist, scatter), probability, bare(probability))
+    assert factor is not None
+    assert float(factor.find_factor(probability[:1], bare(probability[:1]))) == pytest.approx(
+        0.5, rel=0.05
+    )
 
 
 def test_the_covariance_about_the_estimate_is_that_of_the_model() -> None:
@@ -335,9 +357,16 @@ def test_the_factor_goes_by_the_default_tolerance_whatever_the_verdict_goes_by()
 
 def test_a_scale_is_stored_and_read_and_older_calibrations_have_none() -> None:
     plain = calibration(BeliefScale(-0.25, -0.125)).to_plain()
-    assert plain["belief_scale"] == {"bias": -0.25, "slope": -0.125, "weights": []}
+    usual = {"bias": -0.25, "slope": -0.125, "weights": [], "degrees": 5}
+    assert plain["belief_scale"] == usual
     assert read_calibration(plain, "x").belief_scale == BeliefScale(-0.25, -0.125)
-    plain = calibration(BeliefScale(-0.25, -0.125, (0.5,))).to_plain()
+    plain = calibration(BeliefScale(-0.25, -0.125, (0.5,), 3)).to_plain()
+    assert read_calibration(plain, "x").belief_scale == BeliefScale(-0.25, -0.125, (0.5,), 3)
+    for wrong in (4, 3.0, True, "3"):
+        plain["belief_scale"]["degrees"] = wrong
+        with pytest.raises(UserError, match="degrees"):
+            read_calibration(plain, "x")
+    del plain["belief_scale"]["degrees"]
     assert read_calibration(plain, "x").belief_scale == BeliefScale(-0.25, -0.125, (0.5,))
     del plain["belief_scale"]["weights"]  # of an earlier version
     assert read_calibration(plain, "x").belief_scale == BeliefScale(-0.25, -0.125)

@@ -5,9 +5,11 @@ which directions it is uncertain.  Its size is that of the filter's last noise l
 the estimate's error: refinements move the estimate and not the particles.  The calibration frames
 tell the size.  The error of a right estimate, a twist e (6,), is modeled as Student's t:
 
-    e ~ t_5(0, s^2 C),    log s = bias + slope * logit(probability) + weights . features
+    e ~ t_n(0, s^2 C),    log s = bias + slope * logit(probability) + weights . features
 
-with numbers that maximize the posterior over the frames whose estimate is right.  The features are
+with numbers that maximize the posterior over the frames whose estimate is right.  The degrees of
+freedom n are 5, or 3 or 8 where these explain the frames clearly better: an alignment that succeeds
+in most frames, and not in all, leaves errors with heavier tails.  The features are
 those of the calibration, standardized by it: by the probability alone beliefs would be as wide as
 they should be over all images, and too narrow where the object is occluded.  A calibrated belief
 has draws of this distribution about the estimate in place of the particles that are near it;
@@ -30,7 +32,9 @@ from posefilter.geometry.symmetries import densify, gather_copies
 from posefilter.types import BeliefBatch, ObjectModel
 
 FEWEST_RIGHT = 10  # frames with a right estimate that a fit takes
-_DEGREES = 5.0  # of freedom: of 3, 5 and 8 the densest at held-out errors of ten objects
+DEGREES = 5  # of freedom: of 3, 5 and 8 the densest at held-out errors of ten objects
+POSSIBLE_DEGREES = (3, 5, 8)
+_CLEARLY = 3.0  # [nat] by which other degrees of freedom must explain the frames better
 _LOGIT = 5.0  # beyond, on either side, frames are too few to tell more
 # mean and standard deviation of the prior, near the mean and the spread of ten objects' own fits
 _BIAS, _SLOPE = (-0.2, 0.5), (-0.2, 0.1)
@@ -41,7 +45,8 @@ _MOST = 2.0  # of the log of the factor: features beyond those that were seen sa
 # much as so many particles: C has full rank also where few are near the estimate
 _PRIOR_ERROR, _PRIOR_COUNT = 0.03, 4.0
 _FEWEST_PARTICLES, _FEWEST_DRAWS = 200, 32
-_SEED = 197  # of 300, that whose draws' lengths are nearest to the distribution's
+# by degrees of freedom: of 300, that whose draws' lengths are nearest to the distribution's
+_SEEDS = {3: 2, 5: 197, 8: 157}
 
 
 @dataclass(frozen=True)
@@ -53,11 +58,13 @@ class BeliefScale:
         bias: Log of the factor at a probability of one half.
         slope: By how much it rises with the probability's logit.
         weights: By how much it rises with each standardized feature; none: of an earlier version.
+        degrees: Of freedom, of Student's t.
     """
 
     bias: float
     slope: float
     weights: tuple[float, ...] = ()
+    degrees: int = DEGREES
 
     def find_factor(self, probability: Tensor, features: Tensor) -> Tensor:
         """Return the factors of B estimates.
@@ -120,17 +127,25 @@ def fit_belief_scale(
     own_spread = x[:, 2:].std(axis=0).clip(_LEAST_SPREAD)
     deviation = np.array([_BIAS[1], _SLOPE[1], *(_WEIGHT / own_spread)])
 
-    def negative_log_posterior(w: np.ndarray) -> tuple[float, np.ndarray]:
-        """Return it up to a constant, and its gradient."""
+    def negative_log_posterior(w: np.ndarray, degrees: int) -> tuple[float, np.ndarray]:
+        """Return it up to a constant, the same for all degrees of freedom, and its gradient."""
         log_factor = x @ w
-        ratio = distance * np.exp(-2 * log_factor) / _DEGREES
-        own = 6 * log_factor + 0.5 * (_DEGREES + 6) * np.log1p(ratio)
-        slopes = 6 - (_DEGREES + 6) * ratio / (1 + ratio)
+        ratio = distance * np.exp(-2 * log_factor) / degrees
+        constant = math.lgamma(degrees / 2) - math.lgamma(degrees / 2 + 3) + 3 * math.log(degrees)
+        own = constant + 6 * log_factor + 0.5 * (degrees + 6) * np.log1p(ratio)
+        slopes = 6 - (degrees + 6) * ratio / (1 + ratio)
         away = (w - mean) / deviation
         return float(own.sum() + 0.5 * np.square(away).sum()), slopes @ x + away / deviation
 
-    found = minimize(negative_log_posterior, mean, jac=True, method="BFGS").x
-    return BeliefScale(float(found[0]), float(found[1]), tuple(found[2:].tolist()))
+    def fit(degrees: int) -> tuple[float, BeliefScale]:
+        """Return the negative log-posterior at its minimum, and where that is."""
+        found = minimize(negative_log_posterior, mean, (degrees,), jac=True, method="BFGS")
+        bias, slope, *weights = found.x.tolist()
+        return float(found.fun), BeliefScale(bias, slope, tuple(weights), degrees)
+
+    cost, scale = fit(DEGREES)
+    other_cost, other = min((fit(degrees) for degrees in POSSIBLE_DEGREES), key=lambda one: one[0])
+    return other if other_cost < cost - _CLEARLY else scale
 
 
 def calibrate_belief(
@@ -158,7 +173,8 @@ def calibrate_belief(
     factors = scale.find_factor(probability.detach().cpu(), features.detach().cpu())
     count = max(belief.log_weights.shape[1], _FEWEST_PARTICLES)
     rows = [
-        _redraw(belief, i, float(factor), count, object_model) for i, factor in enumerate(factors)
+        _redraw(belief, i, float(factor), count, object_model, scale.degrees)
+        for i, factor in enumerate(factors)
     ]
     poses, log_weights, draws = zip(*rows, strict=True)
     whole = belief._replace(
@@ -169,7 +185,12 @@ def calibrate_belief(
 
 
 def _redraw(
-    belief: BeliefBatch, i: int, factor: float, count: int, object_model: ObjectModel
+    belief: BeliefBatch,
+    i: int,
+    factor: float,
+    count: int,
+    object_model: ObjectModel,
+    degrees: int,
 ) -> tuple[Tensor, Tensor, int]:
     """Return the poses (count, 4, 4) and log weights (count,) of one calibrated belief, float64,
     and how many of the first are draws.
@@ -185,7 +206,8 @@ def _redraw(
     rest = count - own
     if own == _FEWEST_DRAWS or not rest:  # few particles are near the estimate, or all are
         mass = max(mass, own / count)
-    twist = factor * draw_student_t(own) @ torch.linalg.cholesky(scatter).mT / _unit(object_model)
+    draws = factor * draw_student_t(own, degrees)
+    twist = draws @ torch.linalg.cholesky(scatter).mT / _unit(object_model)
     drawn = _turn_between(
         move_about(best, twist, object_model.center.detach().cpu().double()), object_model
     )
@@ -219,25 +241,24 @@ def _resample(poses: Tensor, weights: Tensor, count: int) -> Tensor:
     return poses[torch.searchsorted(ladder, steps).clamp_max(len(weights) - 1)]
 
 
-def draw_student_t(count: int, seed: int = _SEED) -> Tensor:
+def draw_student_t(count: int, degrees: int = DEGREES, seed: int | None = None) -> Tensor:
     """Return draws (count, 6) of Student's t about 0, in opposite pairs.
 
-    Their second moment is exactly that of the distribution, 5/3 along each axis.  Pairs follow each
-    other, so that the first ones are as good as all.
+    Their second moment is exactly that of the distribution, n / (n - 2) along each axis.  Pairs
+    follow each other, so that the first ones are as good as all.
 
     Args:
         count: 32 at least.
-        seed: Of the generator.
+        degrees: Of freedom, n.
+        seed: Of the generator; None: a good one.
     """
-    generator = torch.Generator().manual_seed(seed)
+    generator = torch.Generator().manual_seed(_SEEDS[degrees] if seed is None else seed)
     half = torch.randn((count + 1) // 2, 6, generator=generator, dtype=torch.float64)
-    squares = torch.randn(
-        (len(half), int(_DEGREES)), generator=generator, dtype=torch.float64
-    ).square()
-    half = half * (_DEGREES / squares.sum(1, keepdim=True)).sqrt()
+    squares = torch.randn((len(half), degrees), generator=generator, dtype=torch.float64).square()
+    half = half * (degrees / squares.sum(1, keepdim=True)).sqrt()
     draws = torch.stack([half, -half], dim=1).flatten(0, 1)[:count]
     own = torch.linalg.cholesky(draws.mT @ draws / count)
-    wanted = math.sqrt(_DEGREES / (_DEGREES - 2))
+    wanted = math.sqrt(degrees / (degrees - 2))
     return wanted * torch.linalg.solve_triangular(own, draws.mT, upper=False).mT
 
 

@@ -21,7 +21,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from posefilter.confidence.belief_scale import BeliefScale
+from posefilter.confidence.belief_scale import DEGREES, POSSIBLE_DEGREES, BeliefScale
 from posefilter.confidence.conformal import GROUPED_BY, Conformal
 from posefilter.confidence.logistic import Logistic, fit_logistic
 from posefilter.confidence.tolerance import RIGHT, PoseErrors, PoseTolerance
@@ -291,9 +291,10 @@ def _logistic(content: Any, count: int, name: str) -> Logistic:
 def _belief_scale(content: Any, count: int) -> BeliefScale | None:
     if content is None:
         return None
-    # earlier versions have no weights
-    if not isinstance(content, dict) or set(content) - {"weights"} != {"bias", "slope"}:
-        raise ValueError("should have bias, slope and weights in belief_scale")
+    # earlier versions have no weights, and the usual degrees of freedom
+    later = {"weights", "degrees"}
+    if not isinstance(content, dict) or set(content) - later != {"bias", "slope"}:
+        raise ValueError("should have bias, slope, weights and degrees in belief_scale")
     weights = content.get("weights", [])
     if not isinstance(weights, list) or len(weights) not in (0, count):
         raise ValueError(f"should have {count} weights in belief_scale")
@@ -301,7 +302,10 @@ def _belief_scale(content: Any, count: int) -> BeliefScale | None:
     numbers = _numbers(given, len(given), "belief_scale", minimum=-_MOST_LOG)
     if max(numbers) > _MOST_LOG:
         raise ValueError("has numbers out of range in belief_scale")
-    return BeliefScale(numbers[0], numbers[1], numbers[2:])
+    degrees = content.get("degrees", DEGREES)
+    if type(degrees) is not int or degrees not in POSSIBLE_DEGREES:
+        raise ValueError(f"should have degrees of {POSSIBLE_DEGREES} in belief_scale")
+    return BeliefScale(numbers[0], numbers[1], numbers[2:], degrees)
 
 
 def _errors(content: Any, count: int) -> CalibrationErrors | None:
