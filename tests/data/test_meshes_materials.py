@@ -46,7 +46,7 @@ def test_polygons_are_covered_once(rng_points: list[np.ndarray]) -> None:
 def rng_points() -> list[np.ndarray]:
     """Return star-shaped polygons of 4 to 30 corners, and a square with a hole, cut open."""
     rng = np.random.default_rng(0)
-    stars = []
+    stars = [np.array([(0, 0), (2, 0), (2, 1), (1, 1), (1, 1), (1, 2), (0, 2)], dtype=float)]
     for count in range(4, 31):
         angles = (np.arange(count) + 0.8 * rng.random(count)) / count * 2 * np.pi
         radius = 0.2 + rng.random(count)
@@ -109,6 +109,86 @@ def test_binary_ply_with_faces_of_several_sizes(order: str, tmp_path: Path) -> N
     file.write_bytes(header.encode() + body[:-30])
     with pytest.raises(UserError, match="cut short"):
         read_mesh(file, "a")
+
+
+def _write_text(path: Path, lines: str) -> Path:
+    path.write_text(lines)
+    return path
+
+
+CORNERS = "v 0 0 0 {0}\nv 1 0 0 {0}\nv 0 1 0 {0}\nvt 0 0\nvt 1 0\nvt 0 1\n"
+
+
+def test_vertex_colors_of_an_obj_are_as_they_are(tmp_path: Path) -> None:
+    path = _write_text(tmp_path / "a.obj", CORNERS.format("1 0.5 0") + "f 1 2 3\n")
+    colors = surface_colors(read_mesh(path, "a"), np.array([0]), MIDDLE)
+    np.testing.assert_allclose(colors, [[1, 0.5, 0]], atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    "material",
+    ["Kd 2 -1 0\n", "map_Kd -clamp on -bm 1.0 -s 1 1 1 my\\p 1.png\n", "map_Kd -o 0 0 0 p.png\n"],
+)
+def test_materials_of_other_exporters_are_read(material: str, tmp_path: Path) -> None:
+    (tmp_path / "my").mkdir()
+    picture = _save(tmp_path / "my" / "p 1.png", 16, 16)
+    assert cv2.imwrite(str(tmp_path / "p.png"), picture[..., ::-1])
+    (tmp_path / "a.mtl").write_text("newmtl other\nKd 0 0 1\n")
+    (tmp_path / "b.mtl").write_bytes(f"newmtl m\n{material}".replace("\n", "\r\n").encode())
+    text = "mtllib a.mtl b.mtl\n" + CORNERS.format("") + "usemtl m\nf 1/1 2/2 \\\n3/3 # a face\n"
+    path = tmp_path / "a.obj"
+    path.write_bytes(text.replace("\n", "\r\n").encode())
+    mesh = read_mesh(path, "a")
+    if material.startswith("Kd"):
+        assert mesh.texture.tolist() == [[[255, 0, 0]]]
+    else:
+        np.testing.assert_array_equal(mesh.texture, picture)
+
+
+@pytest.mark.parametrize(
+    ("material", "told"),
+    [
+        ("map_Kd -s 2 2 1 p.png", "map_Kd with -s"),
+        ("map_Kd -o 0.5 0 0 p.png", "map_Kd with -o"),
+        ("Kd", "Kd of material 'm' should have three numbers"),
+        ("Kd 1 nan 0", "Kd of material 'm' should have three numbers"),
+    ],
+)
+def test_materials_that_would_look_otherwise_are_refused(
+    material: str, told: str, tmp_path: Path
+) -> None:
+    _save(tmp_path / "p.png", 16, 16)
+    (tmp_path / "a.mtl").write_text(f"newmtl m\n{material}\n")
+    text = "mtllib a.mtl\n" + CORNERS.format("") + "usemtl m\nf 1/1 2/2 3/3\n"
+    with pytest.raises(UserError, match=rf"a\.mtl: {told}"):
+        read_mesh(_write_text(tmp_path / "a.obj", text), "a")
+
+
+def test_normals_that_are_no_numbers_are_made_anew(tmp_path: Path) -> None:
+    text = CORNERS.format("") + "vn inf 0 0\nf 1//1 2//1 3//1\n"
+    mesh = read_mesh(_write_text(tmp_path / "a.obj", text), "a")
+    np.testing.assert_allclose(mesh.corner_normals, [[[0, 0, 1]] * 3])
+
+
+PLY = (
+    "ply\nformat ascii 1.0\nelement vertex 4\nproperty float x\nproperty float y\n"
+    "property float z\n{0}element face {1}\nproperty list uchar int vertex_indices\n{2}end_header\n"
+)
+
+
+def test_broken_text_ply_is_refused(tmp_path: Path) -> None:
+    rows = "0 0 0\n1 0 0\n1 1 0\n0 1 0\n3 0 1 2\n3 0 2 3\n"
+    path = tmp_path / "a.ply"
+    assert len(read_mesh(_write_text(path, PLY.format("", 2, "") + rows), "a").faces) == 2
+    with pytest.raises(UserError, match="names 7 rows, and it has fewer"):
+        read_mesh(_write_text(path, PLY.format("", 3, "") + rows), "a")
+    wide = "property ushort red\nproperty ushort green\nproperty ushort blue\n"
+    with pytest.raises(UserError, match="colors of 16 bits"):
+        read_mesh(_write_text(path, PLY.format(wide, 2, "") + rows), "a")
+    own = "property uchar red\nproperty uchar green\nproperty uchar blue\n"
+    quad = "0 0 0\n1 0 0\n1 1 0\n0 1 0\n4 0 1 2 3 255 0 0\n"
+    with pytest.raises(UserError, match="1 colors for 2 triangles"):
+        read_mesh(_write_text(path, PLY.format("", 1, own) + quad), "a")
 
 
 def _save(path: Path, height: int, width: int) -> np.ndarray:
@@ -175,6 +255,28 @@ def test_a_picture_of_many_materials_is_kept_once(tmp_path: Path) -> None:
         + "".join(f"usemtl {n}\nf 1/1 2/2 3/3\n" for n in names)
     )
     assert read_mesh(tmp_path / "a.obj", "a").texture.shape == (80, 80, 3)
+
+
+def test_many_pictures_are_nearly_a_square(tmp_path: Path) -> None:
+    names = [f"m{i}" for i in range(12)]
+    for i, name in enumerate(names):
+        _save(tmp_path / f"{name}.png", 60 + i, 64)
+    (tmp_path / "a.mtl").write_text("".join(f"newmtl {n}\nmap_Kd {n}.png\n" for n in names))
+    (tmp_path / "a.obj").write_text(
+        "mtllib a.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0.1 0.1\nvt 0.9 0\nvt 0 0.9\n"
+        + "".join(f"usemtl {n}\nf 1/1 2/2 3/3\n" for n in names)
+    )
+    mesh = read_mesh(tmp_path / "a.obj", "a")
+    height, width = mesh.texture.shape[:2]
+    assert max(height, width) < 1.5 * min(height, width)
+    weights = np.random.default_rng(0).dirichlet([1, 1, 1], 50)
+    uv = np.array([(0.1, 0.1), (0.9, 0), (0, 0.9)], dtype=np.float32)
+    for face, name in enumerate(names):
+        picture = cv2.imread(str(tmp_path / f"{name}.png"))[..., ::-1]
+        want = surface_colors(_alone(mesh, face, uv, picture), np.zeros(50, int), weights)
+        got = surface_colors(mesh, np.full(50, face), weights)
+        inner = (weights @ uv * 64 > 1).all(1)
+        np.testing.assert_allclose(got[inner], want[inner], atol=2e-3)
 
 
 def test_a_picture_repeated_without_end_is_refused(
@@ -266,6 +368,42 @@ def _export_with_colors(body: trimesh.Trimesh, colors: np.ndarray, path: Path) -
     chunks = struct.pack("<I4s", len(text), b"JSON") + text
     chunks += struct.pack("<I4s", len(binary), b"BIN\0") + binary
     path.write_bytes(struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks)
+
+
+CHANGES = {
+    "sparse": (lambda t: t["accessors"][0].update(sparse={}), "sparse array"),
+    "fan": (lambda t: t["meshes"][0]["primitives"][0].update(mode=6), "fan of triangles"),
+    "second coordinates": (
+        lambda t: t["materials"][0]["pbrMetallicRoughness"].update(
+            baseColorTexture={"index": 0, "texCoord": 1}
+        ),
+        "other than the first",
+    ),
+    "no such picture": (
+        lambda t: (
+            t.update(textures=[{"source": 5}]),
+            t["materials"][0]["pbrMetallicRoughness"].update(baseColorTexture={"index": 0}),
+        ),
+        "picture that is not there",
+    ),
+    "deep": (
+        lambda t: t.update(nodes=[{"children": [i + 1]} for i in range(200)] + [{"mesh": 0}]),
+        "more than 100 deep",
+    ),
+}
+
+
+@pytest.mark.parametrize("what", CHANGES)
+def test_a_glb_that_would_look_otherwise_is_refused(what: str, tmp_path: Path) -> None:
+    body = _tetrahedron()
+    white = trimesh.visual.material.PBRMaterial(baseColorFactor=[1.0, 1.0, 1.0, 1.0])
+    body.visual = trimesh.visual.TextureVisuals(material=white)
+    change, told = CHANGES[what]
+    (tmp_path / "a.glb").write_bytes(body.export(file_type="glb"))
+    read_mesh(tmp_path / "a.glb", "a")
+    (tmp_path / "a.glb").write_bytes(body.export(file_type="glb", tree_postprocessor=change))
+    with pytest.raises(UserError, match=told):
+        read_mesh(tmp_path / "a.glb", "a")
 
 
 @pytest.mark.parametrize("given", [True, False])

@@ -7,6 +7,7 @@ import cv2
 import numpy as np
 
 from posefilter.errors import UserError
+from posefilter.limits import MOST_SIDE
 from posefilter.meshes.obj import MOST_TEXELS, Material, RawMesh
 
 _MARGIN = 8  # [px] round each picture, so that smaller levels of the texture do not mix them
@@ -90,26 +91,56 @@ def _stack(
     names = [(id(p), *c) for p, c in zip(pictures, copies.tolist(), strict=True)]
     first = {name: i for i, name in reversed(list(enumerate(names)))}
     kept = sorted(first.values())
-    width, heights = sizes[kept, 0].max() + 2 * _MARGIN, sizes[kept, 1] + 2 * _MARGIN
-    height = heights.sum()
-    if width * height > MOST_TEXELS:
+    width = int(sizes[kept, 0].max()) + 2 * _MARGIN  # of a column
+    heights = sizes[kept, 1].astype(int) + 2 * _MARGIN
+    columns = _fill_columns(heights.tolist(), width)
+    height, across = max(int(heights[own].sum()) for own in columns), width * len(columns)
+    if across * height > MOST_TEXELS or max(across, height) > MOST_SIDE:
         often = f", repeated {int(copies.prod(axis=1).max())} times" if copies.max() > 1 else ""
         raise UserError(
-            f"{path}: too large: its {len(kept)} textures together have {width:.0f}x{height:.0f} "
+            f"{path}: too large: its {len(kept)} textures together have {across}x{height} "
             f"pixels{often}; scale them down"
         )
-    blocks, top = [], np.zeros(len(pictures))
-    for i, above in zip(kept, np.cumsum(heights) - heights, strict=True):
-        across, down = copies[i].astype(int)
-        tiled = np.tile(pictures[i], (down, across, 1))
-        right = int(width) - tiled.shape[1] - _MARGIN
-        border = (_MARGIN, _MARGIN, _MARGIN, right)
-        blocks.append(cv2.copyMakeBorder(tiled, *border, cv2.BORDER_REPLICATE))
-        top[i] = above + _MARGIN
-    top = top[[first[name] for name in names]]
+    texture = np.zeros((height, across, 3), np.uint8)
+    corner = np.zeros((len(pictures), 2))  # left and upper, of what is in the margins
+    for column, own in enumerate(columns):
+        top = 0
+        for i, high in zip(np.array(kept)[own], heights[own], strict=True):
+            times, down = copies[i].astype(int)
+            tiled = np.tile(pictures[i], (down, times, 1))
+            border = (_MARGIN, _MARGIN, _MARGIN, width - tiled.shape[1] - _MARGIN)
+            block = cv2.copyMakeBorder(tiled, *border, cv2.BORDER_REPLICATE)
+            texture[top : top + high, column * width : (column + 1) * width] = block
+            corner[i] = column * width + _MARGIN, top + _MARGIN
+            top += high
+    corner = corner[[first[name] for name in names]]
     pixels = np.array([p.shape[1::-1] for p in pictures])[which][:, None]  # (F, 1, 2)
     at = (uv * pixels).clip(0, sizes[which][:, None])
-    x = (at[..., 0] + _MARGIN) / width
+    left, top = (corner[which][:, i, None] for i in (0, 1))
+    x = (at[..., 0] + left) / across
     # v = 0 is the lower edge of the picture, whose rows are counted from above
-    y = 1 - (top[which][:, None] + sizes[which][:, None, 1] - at[..., 1]) / height
-    return np.stack([x, y], axis=-1).astype(np.float32), np.concatenate(blocks)
+    y = 1 - (top + sizes[which][:, None, 1] - at[..., 1]) / height
+    return np.stack([x, y], axis=-1).astype(np.float32), texture
+
+
+def _fill_columns(heights: list[int], width: int) -> list[list[int]]:
+    """Divide pictures into columns such that the whole is nearly a square: renderers take the
+    texture's resolution to be the same along both axes.
+
+    Args:
+        heights: Of the pictures [px].
+        width: Of a column [px].
+
+    Returns:
+        Which are in each.
+    """
+    most = max(*heights, round((sum(heights) * width) ** 0.5), 0)
+    columns: list[list[int]] = [[]]
+    filled = 0
+    for i, height in enumerate(heights):
+        if filled + height > most:
+            columns.append([])
+            filled = 0
+        columns[-1].append(i)
+        filled += height
+    return columns

@@ -56,11 +56,15 @@ def _finish(raw: RawMesh, path: Path, name: str, scale: float) -> Mesh:
         raise UserError(f"{path}: the mesh has no triangles (is it a point cloud, or cut short?)")
     if raw.faces.min() < 0 or raw.faces.max() >= len(raw.vertices):
         raise UserError(f"{path}: a face names a vertex that is not there (is the file cut short?)")
+    if raw.vertices.shape[1:] != (3,):
+        raise UserError(f"{path}: vertices of {raw.vertices.shape[1:]} numbers, not three")
     if not np.isfinite(raw.vertices).all():
         raise UserError(f"{path}: vertices that are not finite numbers")
     for part in (raw.corner_uv, raw.corner_colors):
-        if part is not None and not np.isfinite(part).all():
+        if part is not None and not (np.abs(part) < _FARTHEST).all():
             raise UserError(f"{path}: texture coordinates or colors that are not finite numbers")
+    if raw.corner_colors is not None and raw.corner_colors.shape[-1] != 3:
+        raise UserError(f"{path}: colors of {raw.corner_colors.shape[-1]} numbers, not three")
     # stray vertices would spoil bounds, hull and diameter
     used, faces = np.unique(raw.faces, return_inverse=True)
     faces = faces.reshape(-1, 3).astype(np.int64)
@@ -75,8 +79,9 @@ def _finish(raw: RawMesh, path: Path, name: str, scale: float) -> Mesh:
     except ValueError as error:
         raise UserError(f"{path}: not a readable mesh ({error})") from error
     if raw.corner_normals is not None:
-        length = np.linalg.norm(raw.corner_normals, axis=-1, keepdims=True)
-        given = raw.corner_normals / np.maximum(length, 1e-12)
+        own = np.nan_to_num(raw.corner_normals, nan=0.0, posinf=0.0, neginf=0.0)
+        length = np.linalg.norm(own, axis=-1, keepdims=True)
+        given = own / np.maximum(length, 1e-12)
         if turned and (given * normals).sum() < 0:
             given = -given
         normals = np.where(length > 1e-6, given, normals).astype(np.float32)
@@ -168,6 +173,8 @@ def _from_trimesh(mesh: trimesh.Trimesh, path: Path) -> RawMesh:
         material = Material(np.ones(3), None)
     elif visual is not None and visual.kind == "face":
         colors = np.asarray(visual.face_colors)[:, None, :3].repeat(3, axis=1) / 255
+        if len(colors) != len(faces):  # of polygons
+            raise UserError(f"{path}: {len(colors)} colors for {len(faces)} triangles; triangulate")
         material = Material(np.ones(3), None)
     if linear and material is not PLAIN:
         material = material._replace(color=_encode_srgb(material.color))

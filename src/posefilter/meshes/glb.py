@@ -20,6 +20,8 @@ _MOST_NODES = 10_000
 _MOST_JSON = 1 << 24  # [bytes]
 # extensions that change neither the shape nor the picture on it
 _HARMLESS = {"KHR_materials_unlit", "KHR_materials_specular", "KHR_materials_ior"}
+_FAN, _FLOAT, _USHORT = 6, 5126, 5123  # a kind of primitive, and kinds of numbers
+_DEEPEST = 100  # nodes within each other
 _JSON, _BINARY = 0x4E4F534A, 0x004E4942  # kinds of chunks
 
 
@@ -39,6 +41,7 @@ def check_glb(path: Path) -> None:
         _check_extensions(content, path)
         _check_counts(content, path)
         _check_nodes(content, path)
+        _check_surfaces(content, path)
         _check_images(content, chunks.get(_BINARY, b""), path)
     except (ValueError, TypeError, KeyError, IndexError, AttributeError, RecursionError) as error:
         raise UserError(f"{path}: a broken GLB file ({type(error).__name__}: {error})") from error
@@ -69,6 +72,8 @@ def _check_counts(content: Mapping[str, Any], path: Path) -> None:
             if "uri" in one:
                 raise UserError(f"{path}: its {part} are in other files; embed them")
     for accessor in content.get("accessors", []):
+        if "sparse" in accessor:
+            raise UserError(f"{path}: has a sparse array, which is not read; export it without")
         if not 0 <= accessor["count"] <= MOST_ELEMENTS:
             raise UserError(f"{path}: too large: {accessor['count']:,} elements in one array")
 
@@ -79,6 +84,11 @@ def _check_nodes(content: Mapping[str, Any], path: Path) -> None:
     parents = Counter(child for node in nodes for child in node.get("children", []))
     if len(nodes) > _MOST_NODES or any(count > 1 for count in parents.values()):
         raise UserError(f"{path}: its nodes are no tree, or more than {_MOST_NODES:,}")
+    level = [i for i in range(len(nodes)) if i not in parents]
+    for _ in range(_DEEPEST):
+        level = [child for i in level for child in nodes[i].get("children", [])]
+    if level:
+        raise UserError(f"{path}: its nodes are more than {_DEEPEST} deep")
     meshes, accessors = content.get("meshes", []), content.get("accessors", [])
     shown = 0
     for node in nodes:
@@ -87,6 +97,34 @@ def _check_nodes(content: Mapping[str, Any], path: Path) -> None:
             shown += sum(accessors[place]["count"] for place in places if place is not None)
     if shown > MOST_ELEMENTS:
         raise UserError(f"{path}: too large: its nodes show {shown:,} elements")
+
+
+def _check_surfaces(content: Mapping[str, Any], path: Path) -> None:
+    """Refuse what the reader would show otherwise than the file means it."""
+    accessors, textures = content.get("accessors", []), content.get("textures", [])
+    for material in content.get("materials", []):
+        gloss = material.get("extensions", {}).get("KHR_materials_pbrSpecularGlossiness")
+        if gloss is not None and not {"diffuseFactor", "specularFactor"} <= set(gloss):
+            raise UserError(f"{path}: uses KHR_materials_pbrSpecularGlossiness; export it without")
+        used = material.get("pbrMetallicRoughness", {}).get("baseColorTexture")
+        if used is None:
+            continue
+        if used.get("texCoord", 0) != 0:
+            raise UserError(f"{path}: a picture by texture coordinates other than the first")
+        source = textures[used["index"]].get("source")
+        if source is not None and not 0 <= source < len(content.get("images", [])):
+            raise UserError(f"{path}: names a picture that is not there")
+    for mesh in content.get("meshes", []):
+        for part in mesh["primitives"]:
+            if part.get("mode", 4) == _FAN:
+                raise UserError(f"{path}: has a fan of triangles; export it as triangles")
+            places = part.get("attributes", {})
+            uv, color = places.get("TEXCOORD_0"), places.get("COLOR_0")
+            if uv is not None and accessors[uv]["componentType"] != _FLOAT:
+                raise UserError(f"{path}: texture coordinates of whole numbers; export floats")
+            wide = color is not None and accessors[color]["componentType"] == _USHORT
+            if wide and "material" not in part:
+                raise UserError(f"{path}: colors of 16 bits without a material; export one")
 
 
 def _check_images(content: Mapping[str, Any], binary: bytes, path: Path) -> None:

@@ -77,11 +77,12 @@ def _read_mtl(path: Path, source: Path, images: dict[Path, np.ndarray]) -> dict[
         elif key == "kd" and name:
             color = [float(x) for x in rest.split()[:3]]
             color = color * 3 if len(color) == 1 else color  # one number is a gray
+            if len(color) != 3 or not np.isfinite(color).all():
+                raise UserError(f"{path}: Kd of material '{name}' should have three numbers")
+            color = np.clip(color, 0, 1).tolist()
             materials[name] = materials[name]._replace(color=np.array(color))
         elif key == "map_kd" and name:
-            # options such as -s come before the file
-            file = rest.split()[-1] if rest.startswith("-") else rest
-            image = path.parent / file
+            image = path.parent / _skip_options(rest, path).replace("\\", "/")
             if image not in images:
                 images[image] = read_image(image, path)
                 pixels = sum(one.shape[0] * one.shape[1] for one in images.values())
@@ -115,7 +116,9 @@ def read_obj(path: Path) -> RawMesh:
                 corners += [polygon[0], polygon[i], polygon[i + 1]]
                 face_material.append(current)
         elif key == "mtllib":
-            library |= _read_mtl(path.parent / rest, path, images)
+            several = all((path.parent / file).is_file() for file in rest.split())
+            for file in rest.split() if several else [rest]:
+                library |= _read_mtl(path.parent / file, path, images)
         elif key == "usemtl":
             current = materials.setdefault(rest, len(materials))
     index = np.array(corners, dtype=np.int64).reshape(-1, 3, 3)  # face, corner, (v, vt, vn)
@@ -131,8 +134,10 @@ def read_obj(path: Path) -> RawMesh:
             f"{path}: its material '{unknown[0]}' is in no material file (mtllib), so that its "
             f"texture is not known"
         )
+    # colors of vertices are whole by themselves
+    plain = PLAIN if colors is None else PLAIN._replace(color=np.ones(3))
     known = (
-        [library.get(name, PLAIN) for name in materials] or list(library.values())[:1] or [PLAIN]
+        [library.get(name, plain) for name in materials] or list(library.values())[:1] or [plain]
     )
     faces = index[..., 0]
     if len(faces) and (faces.min() < 0 or faces.max() >= len(vertices)):
@@ -148,6 +153,44 @@ def read_obj(path: Path) -> RawMesh:
         np.array(face_material, dtype=np.int64),
         known,
     )
+
+
+# of a map: how many words follow an option
+_OPTIONS = {
+    "-blendu": 1, "-blendv": 1, "-boost": 1, "-bm": 1, "-cc": 1, "-clamp": 1, "-imfchan": 1,
+    "-mm": 2, "-texres": 1, "-type": 1,
+}  # fmt: skip
+
+
+def _skip_options(rest: str, path: Path) -> str:
+    """Return the file that a map's line names, behind its options.
+
+    Raises UserError where these move or repeat the picture, which is not read.
+    """
+    while rest.startswith("-"):
+        option, _, rest = rest.partition(" ")
+        words = rest.split()
+        if option in ("-s", "-o", "-t"):
+            count = 0
+            while count < 3 and count < len(words) - 1 and _is_number(words[count]):
+                count += 1
+            neutral = 1.0 if option == "-s" else 0.0
+            if any(float(word) != neutral for word in words[:count]):
+                raise UserError(f"{path}: map_Kd with {option}, which is not read; bake it")
+        elif option in _OPTIONS:
+            count = _OPTIONS[option]
+        else:
+            return words[-1] if words else ""
+        rest = rest.split(None, count)[-1] if len(words) > count else ""
+    return rest
+
+
+def _is_number(word: str) -> bool:
+    try:
+        float(word)
+    except ValueError:
+        return False
+    return True
 
 
 def _split(index: np.ndarray, vertices: np.ndarray, firsts: np.ndarray, count: int) -> None:
@@ -167,9 +210,12 @@ def _split(index: np.ndarray, vertices: np.ndarray, firsts: np.ndarray, count: i
 
 def _read_lines(path: Path) -> Iterator[tuple[str, str]]:
     """Yield keyword and rest of each line; a line that ends with a backslash goes on."""
-    text = read_bytes(path).decode("utf-8-sig", errors="replace").replace("\\\n", " ")
+    text = read_bytes(path).decode("utf-8-sig", errors="replace")
+    text = text.replace("\r\n", "\n").replace("\\\n", " ")
     for line in text.splitlines():
         key, *rest = line.split(None, 1) or [""]
+        if key in ("v", "vt", "vn", "f"):
+            rest = [part.partition("#")[0] for part in rest]
         yield key, "".join(rest).strip()
 
 

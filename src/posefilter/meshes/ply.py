@@ -6,12 +6,13 @@ from pathlib import Path
 
 from posefilter.errors import UserError
 from posefilter.limits import read_bytes
-from posefilter.meshes.ply_faces import split_faces
+from posefilter.meshes.ply_faces import list_elements, split_faces
 
 _END = b"end_header"
 _LONGEST = 1 << 20  # of a header [bytes]
 _TEXTURE = re.compile(r"comment\s+texturefile\s+(.+)", re.IGNORECASE)
 _PROPERTY = re.compile(r"^(\s*property\s+.*\s)(\w+)(\s*)$", re.MULTILINE)
+_COLORS, _WIDE = ("red", "green", "blue"), ("short", "ushort", "int16", "uint16")
 _COORDINATES = ("texture_u", "texture_v", "u", "v", "s", "t", "texcoord")
 
 
@@ -44,7 +45,15 @@ def open_ply(path: Path) -> tuple[io.BytesIO, list[str]]:
             "can have one here; convert it to .obj or .glb"
         )
     header = _PROPERTY.sub(lambda m: m[1] + m[2].removeprefix("diffuse_") + m[3], header)
-    names = {found[2] for found in _PROPERTY.finditer(header)}
+    properties = [(found[1].split(), found[2]) for found in _PROPERTY.finditer(header)]
+    names = {name for _, name in properties}
+    for (_, *kind), name in properties:
+        if name in _COLORS and kind and kind[-1] in _WIDE:
+            raise UserError(f"{path}: colors of 16 bits, which are not read; write them in 8")
+    if re.search(r"^format\s+ascii", header, re.MULTILINE):
+        rows = sum(element.rows for element in list_elements(header))
+        if sum(1 for line in data[end:].splitlines()[1:] if line.strip()) < rows:
+            raise UserError(f"{path}: its header names {rows:,} rows, and it has fewer: cut short?")
     colored, mapped = "red" in names, bool(names & {*_COORDINATES})
     if textures and not mapped and not colored:
         raise UserError(f"{path}: names a texture ({textures[0]}), but no texture coordinates")

@@ -3,7 +3,7 @@
 import re
 import struct
 from collections.abc import Iterator, Mapping
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -18,10 +18,13 @@ _KINDS = {
     **dict.fromkeys(("ushort", "uint16"), "H"),
     **dict.fromkeys(("int", "int32"), "i"),
     **dict.fromkeys(("uint", "uint32"), "I"),
+    "int64": "q",
+    "uint64": "Q",
     **dict.fromkeys(("float", "float32"), "f"),
     **dict.fromkeys(("double", "float64"), "d"),
 }
 _CORNERS = ("vertex_indices", "vertex_index")
+_MOST_ROWS = 2_000_000  # polygons that are split
 _FIRST = ["vertex", "face"]  # the elements of a mesh
 
 
@@ -33,7 +36,7 @@ class _Property(NamedTuple):
     length: str | None  # the kind of a list's length; None: a number
 
 
-class _Element(NamedTuple):
+class Element(NamedTuple):
     """A kind of rows: vertices, faces."""
 
     name: str
@@ -58,8 +61,10 @@ def split_faces(header: str, body: bytes) -> tuple[str, bytes]:
         ValueError, struct.error: The file is cut short or broken.
     """
     form = re.search(r"^format\s+(\w+)", header, re.MULTILINE)
-    elements = list(_list_elements(header))
-    if form is None or form[1] not in _ORDERS or [e.name for e in elements[:2]] != _FIRST:
+    if form is None or form[1] not in _ORDERS:
+        return header, body
+    elements = list(list_elements(header))
+    if [element.name for element in elements[:2]] != _FIRST:
         return header, body
     vertex, face = elements[:2]
     corners = next((p.name for p in face.properties if p.name in _CORNERS and p.length), None)
@@ -69,9 +74,11 @@ def split_faces(header: str, body: bytes) -> tuple[str, bytes]:
     row = np.dtype([(p.name, order + p.kind) for p in vertex.properties])
     first = body.index(b"\n") + 1
     start = first + vertex.rows * row.itemsize
+    if _has_triangles(body[start:], face, corners, order):
+        return header, body
     rows, stop = _read_rows(body, start, face, order)
     sizes = np.array([len(one[corners]) for one in rows])
-    if len(set(sizes.tolist())) < 2:
+    if set(sizes.tolist()) <= {3}:
         return header, body
     table = np.frombuffer(body, row, vertex.rows, first)
     vertices = np.stack([table[axis] for axis in "xyz"], axis=1).astype(np.float64)
@@ -90,11 +97,12 @@ def split_faces(header: str, body: bytes) -> tuple[str, bytes]:
     return header, body[:start] + packed + body[stop:]
 
 
-def _list_elements(header: str) -> Iterator[_Element]:
+def list_elements(header: str) -> Iterator[Element]:
+    """Yield the elements of a PLY file, by its header."""
     for line in header.splitlines():
         match line.split():
             case ["element", name, count]:
-                element = _Element(name, int(count), [])
+                element = Element(name, int(count), [])
                 yield element
             case ["property", "list", count, kind, name]:
                 element.properties.append(_Property(name, _KINDS[kind], _KINDS[count]))
@@ -102,8 +110,27 @@ def _list_elements(header: str) -> Iterator[_Element]:
                 element.properties.append(_Property(name, _KINDS[kind], None))
 
 
-def _read_rows(body: bytes, at: int, element: _Element, order: str) -> tuple[list[_Row], int]:
+def _has_triangles(body: bytes, face: Element, corners: str, order: str) -> bool:
+    """Return whether all faces are triangles with nothing else of a length of its own: most files,
+    in a fraction of the time.
+    """
+    if sum(p.length is not None for p in face.properties) > 1:
+        return False
+    fields: list[Any] = []
+    for name, kind, length in face.properties:
+        fields += [(f"{name} count", order + length)] if length is not None else []
+        fields.append((name, order + kind, 3 if length is not None else 1))
+    row = np.dtype(fields)
+    if len(body) < face.rows * row.itemsize:
+        return False
+    table = np.frombuffer(body, row, face.rows)
+    return bool((table[f"{corners} count"] == 3).all())
+
+
+def _read_rows(body: bytes, at: int, element: Element, order: str) -> tuple[list[_Row], int]:
     """Return an element's rows, and where what comes after them begins."""
+    if element.rows > _MOST_ROWS:
+        raise ValueError(f"{element.rows:,} faces; make them triangles")
     rows: list[_Row] = []
     for _ in range(element.rows):
         row: dict[str, tuple[float, ...]] = {}
@@ -136,7 +163,7 @@ def _take(row: _Row, triangle: list[int], size: int) -> _Row:
     return out
 
 
-def _pack(row: _Row, element: _Element, order: str) -> bytes:
+def _pack(row: _Row, element: Element, order: str) -> bytes:
     out = b""
     for name, kind, length in element.properties:
         values = row[name]

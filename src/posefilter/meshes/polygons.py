@@ -42,7 +42,9 @@ def _find_concave(points: np.ndarray) -> np.ndarray:
     turns = np.cross(np.roll(edges, 1, axis=1), edges)
     area = _areas(points)
     against = (turns * area[:, None]).sum(-1)
-    return np.asarray((against < -_FLAT * (area**2).sum(-1, keepdims=True)).any(axis=1))
+    back = (against < -_FLAT * (area**2).sum(-1, keepdims=True)).any(axis=1)
+    # beside a doubled corner no turn is seen
+    return np.asarray(back | (edges == 0).all(-1).any(axis=1))
 
 
 def _flatten(points: np.ndarray) -> np.ndarray:
@@ -70,6 +72,8 @@ def _is_ear(flat: np.ndarray, left: list[int], at: int) -> bool:
     """Return whether the corner is convex, and no other lies in its triangle."""
     names = [left[at - 1], left[at], left[(at + 1) % len(left)]]
     a, b, c = flat[names]
+    if (a == b).all():
+        return True
     if _cross(b - a, c - b) <= 0:
         return False
     others = flat[[one for one in left if one not in names]]

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from posefilter.meshes.mesh import Mesh, creased_normals
+from posefilter.meshes.mesh import Mesh, creased_normals, sample_surface, surface_colors
 from posefilter.synthetic.textures import (
     find_dominant_color,
     label,
@@ -46,8 +46,16 @@ def make_lookalike(
     if printed and kind < 0.55:
         return stretch(target, name, rng.uniform(0.7, 1.3, 3), random_texture(rng, 256, photos))
     sides = (target.bounds[1] - target.bounds[0]) * rng.uniform(0.45, 1.25, 3)
-    base = find_dominant_color(target.texture) if kind < 0.85 else None
+    base = find_dominant_color(_list_colors(target)) if kind < 0.85 else None
     return box(name, np.maximum(sides, 0.02), [to_uint8(label(rng, 96, base)) for _ in range(6)])
+
+
+def _list_colors(mesh: Mesh) -> np.ndarray:
+    """Return the colors of a mesh as a picture, (n, m, 3) uint8."""
+    if mesh.corner_colors is None:
+        return mesh.texture
+    colors = surface_colors(mesh, *sample_surface(mesh, 4096))
+    return to_uint8(colors).reshape(64, 64, 3)
 
 
 def stretch(mesh: Mesh, name: str, factors: np.ndarray, texture: np.ndarray) -> Mesh:
