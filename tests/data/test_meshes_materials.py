@@ -3,6 +3,7 @@
 import json
 import struct
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -12,7 +13,7 @@ from PIL import Image
 from scipy.spatial.distance import pdist
 
 from posefilter.errors import UserError
-from posefilter.meshes import atlas
+from posefilter.meshes import atlas, ply_faces
 from posefilter.meshes.files import read_mesh
 from posefilter.meshes.mesh import (
     Mesh,
@@ -189,6 +190,28 @@ def test_broken_text_ply_is_refused(tmp_path: Path) -> None:
     quad = "0 0 0\n1 0 0\n1 1 0\n0 1 0\n4 0 1 2 3 255 0 0\n"
     with pytest.raises(UserError, match="1 colors for 2 triangles"):
         read_mesh(_write_text(path, PLY.format("", 1, own) + quad), "a")
+
+
+def test_binary_triangles_are_left_as_they_are(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Also with texture coordinates of their corners, without a look at each."""
+    rows = 50_000
+    header = (
+        f"ply\nformat binary_little_endian 1.0\nelement vertex 3\nproperty float x\n"
+        f"property float y\nproperty float z\nelement face {rows}\n"
+        "property list uchar int vertex_indices\nproperty list uchar float texcoord\n"
+    )
+    face = struct.pack("<B3iB6f", 3, 0, 1, 2, 6, *range(6))
+    body = b"end_header\n" + bytes(36) + face * rows
+    read: list[int] = []
+    own = ply_faces._read_rows
+
+    def count(body: bytes, at: int, element: ply_faces.Element, order: str) -> Any:
+        read.append(element.rows)
+        return own(body, at, element, order)
+
+    monkeypatch.setattr(ply_faces, "_read_rows", count)
+    assert ply_faces.split_faces(header, body) == (header, body)
+    assert read == [1]
 
 
 def _save(path: Path, height: int, width: int) -> np.ndarray:

@@ -74,7 +74,7 @@ def split_faces(header: str, body: bytes) -> tuple[str, bytes]:
     row = np.dtype([(p.name, order + p.kind) for p in vertex.properties])
     first = body.index(b"\n") + 1
     start = first + vertex.rows * row.itemsize
-    if _has_triangles(body[start:], face, corners, order):
+    if _has_triangles(body, start, face, corners, order):
         return header, body
     rows, stop = _read_rows(body, start, face, order)
     sizes = np.array([len(one[corners]) for one in rows])
@@ -110,21 +110,24 @@ def list_elements(header: str) -> Iterator[Element]:
                 element.properties.append(_Property(name, _KINDS[kind], None))
 
 
-def _has_triangles(body: bytes, face: Element, corners: str, order: str) -> bool:
-    """Return whether all faces are triangles with nothing else of a length of its own: most files,
-    in a fraction of the time.
+def _has_triangles(body: bytes, at: int, face: Element, corners: str, order: str) -> bool:
+    """Return whether all faces are triangles, with the same lengths of all else that they have:
+    most files, in a fraction of the time.
     """
-    if sum(p.length is not None for p in face.properties) > 1:
-        return False
+    if not face.rows:
+        return True
+    (first,), _ = _read_rows(body, at, face._replace(rows=1), order)
     fields: list[Any] = []
     for name, kind, length in face.properties:
         fields += [(f"{name} count", order + length)] if length is not None else []
-        fields.append((name, order + kind, 3 if length is not None else 1))
+        fields.append((name, order + kind, (len(first[name]),)))
     row = np.dtype(fields)
-    if len(body) < face.rows * row.itemsize:
+    if len(body) < at + face.rows * row.itemsize:
         return False
-    table = np.frombuffer(body, row, face.rows)
-    return bool((table[f"{corners} count"] == 3).all())
+    table = np.frombuffer(body, row, face.rows, at)
+    lists = [p.name for p in face.properties if p.length is not None]
+    same = all((table[f"{name} count"] == len(first[name])).all() for name in lists)
+    return len(first[corners]) == 3 and same
 
 
 def _read_rows(body: bytes, at: int, element: Element, order: str) -> tuple[list[_Row], int]:
