@@ -42,14 +42,14 @@ def generate(job: Job) -> None:
 
 
 def draw(summary: Summary, job: Job) -> Path | None:
-    """Write preview.png, four of the frames; return None where none shows the object."""
+    """Write preview.png, four of the frames at most; return None where none shows the object."""
     name = job.cfg.object
     # the instances of a class are told apart by its mesh
     several = job.cfg.instances > 1
     meshes = MeshStore(job.cfg.meshes, scale=job.cfg.mesh_scale or 1.0) if several else None
     reader = open_reader("scenes", summary.out, name, meshes)
     path = summary.out / "preview.png"
-    picture = draw_preview(reader, f"{name}: four of {summary.frames} frames")
+    picture = draw_preview(reader, name, summary.frames)
     if picture is None:
         return None
     save_image(picture, path)

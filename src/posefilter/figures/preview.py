@@ -17,9 +17,8 @@ _DEPTH = colormaps["viridis"]
 _UNKNOWN = (40, 40, 40)
 
 
-def draw_preview(reader: BaseReader, title: str, count: int = 4) -> np.ndarray | None:
-    """Return `count` frames, spread evenly over the dataset, each with its depth below it.  ->
-    picture.
+def draw_preview(reader: BaseReader, name: str, frames: int, count: int = 4) -> np.ndarray | None:
+    """Return `count` of a dataset's frames, spread evenly, each with its depth below it.
 
     Frames that cannot be read are left out; None where that leaves none, or none shows the object.
     """
@@ -39,6 +38,7 @@ def draw_preview(reader: BaseReader, title: str, count: int = 4) -> np.ndarray |
     if len(tiles) == 1:  # the rows above and below need the width of two
         tiles.append(np.full_like(tiles[0], 255))
     figure = arrange_grid([tiles[0], *tiles[1:]], len(tiles))
+    title = f"{name}: {len(found)} of {frames} frames"
     head = draw_row(figure.shape[1], title, [("visible part", TRUTH)], size=18)
     return np.concatenate(
         [head, figure, draw_depth_scale(figure.shape[1], float(near), float(far))]
