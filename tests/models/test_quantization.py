@@ -53,6 +53,8 @@ def test_surface_points_come_back_to_a_ten_thousandth_and_the_rest_as_it_was() -
     plain = {**square()._asdict(), "points": points, "texture": texture}
     packed = pack_object(plain)
     assert packed["points"].dtype == packed["texture"].dtype == torch.float16
+    assert pack_object(packed).keys() == packed.keys()
+    assert torch.equal(pack_object(packed)["texture"], packed["texture"])
     after = unpack_object(packed)
     assert after.points.dtype == torch.float32
     assert (after.points - points).abs().max() < 5e-4 * points.abs().max()

@@ -65,11 +65,11 @@ def unpack(packed: Mapping[str, Tensor]) -> dict[str, Tensor]:
 
 def pack_object(plain: Mapping[str, Any]) -> dict[str, Any]:
     """Return an object, as a checkpoint holds it, with surface points in half precision, and the
-    normals and colors of its texture in 8 bits.
+    normals and colors of its texture in 8 bits; one that was packed before is as it was.
     """
     out = {**plain, "points": plain["points"].half()}
     texture = plain.get("texture")
-    if texture is None:
+    if texture is None or plain.get("texture_look") is not None:
         return out
     look = torch.cat([(texture[:, 3:6] + 1) / 2, texture[:, 6:]], dim=1).float()
     packed = (255 * look).round().clamp(0, 255).to(torch.uint8)
