@@ -28,7 +28,8 @@ def find_weights(weights: str | Path | None) -> Path:
     environment variable POSEFILTER_WEIGHTS_URL, if it is set.
 
     Args:
-        weights: A checkpoint, a run's folder, or a name such as `003_cracker_box`.
+        weights: A checkpoint, a run's folder, a name such as `003_cracker_box`, or a pattern of
+            one file.
 
     Raises:
         UserError: There is no such file, and no weights of that name; or they cannot be fetched.
@@ -42,6 +43,14 @@ def find_weights(weights: str | Path | None) -> Path:
     path, name = Path(weights), str(weights)
     if path.exists():
         return path
+    if is_several(name) and name != ALL:  # a pattern of one file
+        one, *others = expand_weights(name)
+        if others:
+            raise UserError(
+                f"checkpoint={weights}: stands for {1 + len(others)} files ({one}, {others[0]}"
+                f"{', ...' if len(others) > 1 else ''}); here it must be one"
+            )
+        return Path(one)
     shipped = list_shipped()
     if name in shipped:
         return shipped[name]

@@ -78,6 +78,19 @@ def test_a_path_is_taken_as_it_is_and_a_name_is_found_among_what_ships(tmp_path:
     assert find_weights("003_cracker_box").is_file()
 
 
+def test_a_pattern_may_stand_for_one_file(tmp_path: Path) -> None:
+    """As that of a run whose folder's name is cut."""
+    own = tmp_path / "model=patch_pf,see_83de" / "best.ckpt"
+    own.parent.mkdir()
+    own.touch()
+    assert find_weights(tmp_path / "*model=patch_pf,*" / "best.ckpt") == own
+    with pytest.raises(UserError, match="no weights there"):
+        find_weights(tmp_path / "*model=pixel_pf,*" / "best.ckpt")
+    (own.parent / "other.ckpt").touch()
+    with pytest.raises(UserError, match=r"stands for 2 files .*; here it must be one"):
+        find_weights(tmp_path / "*" / "*.ckpt")
+
+
 def test_what_ships_is_small_enough_to_be_cloned() -> None:
     sizes = [file.stat().st_size for file in find_weights("003_cracker_box").parent.glob("*.ckpt")]
     assert len(sizes) == 14
