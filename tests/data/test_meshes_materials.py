@@ -147,7 +147,7 @@ def test_materials_of_other_exporters_are_read(material: str, tmp_path: Path) ->
 
 
 @pytest.mark.parametrize(
-    ("material", "told"),
+    ("material", "message"),
     [
         ("map_Kd -s 2 2 1 p.png", "map_Kd with -s"),
         ("map_Kd -o 0.5 0 0 p.png", "map_Kd with -o"),
@@ -156,12 +156,12 @@ def test_materials_of_other_exporters_are_read(material: str, tmp_path: Path) ->
     ],
 )
 def test_materials_that_would_look_otherwise_are_refused(
-    material: str, told: str, tmp_path: Path
+    material: str, message: str, tmp_path: Path
 ) -> None:
     _save(tmp_path / "p.png", 16, 16)
     (tmp_path / "a.mtl").write_text(f"newmtl m\n{material}\n")
     text = "mtllib a.mtl\n" + CORNERS.format("") + "usemtl m\nf 1/1 2/2 3/3\n"
-    with pytest.raises(UserError, match=rf"a\.mtl: {told}"):
+    with pytest.raises(UserError, match=rf"a\.mtl: {message}"):
         read_mesh(_write_text(tmp_path / "a.obj", text), "a")
 
 
@@ -365,7 +365,7 @@ def test_vertex_colors_of_a_glb_multiply_its_material(kind: type, tmp_path: Path
 def _export_with_colors(body: trimesh.Trimesh, colors: np.ndarray, path: Path) -> None:
     """Write a GLB with both a material and colors of vertices, which trimesh writes as neither."""
 
-    def add(tree: dict) -> None:  # type: ignore[type-arg]
+    def add(tree: dict[str, Any]) -> None:
         tree["meshes"][0]["primitives"][0]["attributes"]["COLOR_0"] = len(tree["accessors"])
         tree["bufferViews"].append({"buffer": 0, "byteOffset": 0, "byteLength": 0})
         tree["accessors"].append(
@@ -421,11 +421,11 @@ def test_a_glb_that_would_look_otherwise_is_refused(what: str, tmp_path: Path) -
     body = _tetrahedron()
     white = trimesh.visual.material.PBRMaterial(baseColorFactor=[1.0, 1.0, 1.0, 1.0])
     body.visual = trimesh.visual.TextureVisuals(material=white)
-    change, told = CHANGES[what]
+    change, message = CHANGES[what]
     (tmp_path / "a.glb").write_bytes(body.export(file_type="glb"))
     read_mesh(tmp_path / "a.glb", "a")
     (tmp_path / "a.glb").write_bytes(body.export(file_type="glb", tree_postprocessor=change))
-    with pytest.raises(UserError, match=told):
+    with pytest.raises(UserError, match=message):
         read_mesh(tmp_path / "a.glb", "a")
 
 

@@ -179,9 +179,10 @@ def _check_object(model: Any, said: str) -> None:
             raise UserError(
                 f"{said}: its object's texture_look should be 6 bytes for each of its points"
             )
-    colors = held["texture"][:, 6:] if "texture" in held and not packed else torch.zeros(1)
-    if not bool(((colors >= 0) & (colors <= 1)).all()):
-        raise UserError(f"{said}: its object's texture should have colors in [0, 1]")
+    elif "texture" in held:
+        colors = held["texture"][:, 6:]
+        if not bool(((colors >= 0) & (colors <= 1)).all()):
+            raise UserError(f"{said}: its object's texture should have colors in [0, 1]")
     for key in ("radius", "diameter"):
         if not (isinstance(model[key], float | int) and 0 < model[key] < 1000):
             raise UserError(f"{said}: its object's {key} should be a length [m]")

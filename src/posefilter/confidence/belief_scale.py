@@ -143,9 +143,10 @@ def fit_belief_scale(
         bias, slope, *weights = found.x.tolist()
         return float(found.fun), BeliefScale(bias, slope, tuple(weights), degrees)
 
-    cost, scale = fit(DEGREES)
-    other_cost, other = min((fit(degrees) for degrees in POSSIBLE_DEGREES), key=lambda one: one[0])
-    return other if other_cost < cost - _CLEARLY else scale
+    fits = {degrees: fit(degrees) for degrees in POSSIBLE_DEGREES}
+    cost, usual = fits[DEGREES]
+    least, best = min(fits.values(), key=lambda one: one[0])
+    return best if least < cost - _CLEARLY else usual
 
 
 def calibrate_belief(

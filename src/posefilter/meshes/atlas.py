@@ -37,12 +37,11 @@ def merge_materials(raw: RawMesh, path: Path) -> Surface:
     colors = None if raw.corner_colors is None else raw.corner_colors.astype(np.float32)
     used = np.unique(raw.face_material).tolist()
     pictures = [_picture(raw.materials[i]) for i in used]
-    plain = [raw.corner_uv is None or bool((p == p[:1, :1]).all()) for p in pictures]
     if len(used) == 1:
-        if plain[0]:
+        if raw.corner_uv is None or pictures[0].shape[:2] == (1, 1):
             return Surface(None, pictures[0][:1, :1], colors)
-        assert raw.corner_uv is not None
         return Surface(raw.corner_uv.astype(np.float32), pictures[0], colors)
+    plain = [raw.corner_uv is None or bool((p == p[:1, :1]).all()) for p in pictures]
     which = np.searchsorted(used, raw.face_material)
     tints = np.array(
         [p[0, 0] / 255 if one else np.ones(3) for p, one in zip(pictures, plain, strict=True)]

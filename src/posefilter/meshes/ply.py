@@ -12,7 +12,7 @@ _END = b"end_header"
 _LONGEST = 1 << 20  # of a header [bytes]
 _TEXTURE = re.compile(r"comment\s+texturefile\s+(.+)", re.IGNORECASE)
 _PROPERTY = re.compile(r"^(\s*property\s+.*\s)(\w+)(\s*)$", re.MULTILINE)
-_COLORS, _WIDE = ("red", "green", "blue"), ("short", "ushort", "int16", "uint16")
+_COLORS, _WIDE = ("red", "green", "blue"), ("h", "H")
 _COORDINATES = ("texture_u", "texture_v", "u", "v", "s", "t", "texcoord")
 
 
@@ -45,13 +45,13 @@ def open_ply(path: Path) -> tuple[io.BytesIO, list[str]]:
             "can have one here; convert it to .obj or .glb"
         )
     header = _PROPERTY.sub(lambda m: m[1] + m[2].removeprefix("diffuse_") + m[3], header)
-    properties = [(found[1].split(), found[2]) for found in _PROPERTY.finditer(header)]
-    names = {name for _, name in properties}
-    for (_, *kind), name in properties:
-        if name in _COLORS and kind and kind[-1] in _WIDE:
-            raise UserError(f"{path}: colors of 16 bits, which are not read; write them in 8")
+    elements = list(list_elements(header))
+    properties = [one for element in elements for one in element.properties]
+    names = {one.name for one in properties}
+    if any(one.name in _COLORS and one.kind in _WIDE for one in properties):
+        raise UserError(f"{path}: colors of 16 bits, which are not read; write them in 8")
     if re.search(r"^format\s+ascii", header, re.MULTILINE):
-        rows = sum(element.rows for element in list_elements(header))
+        rows = sum(element.rows for element in elements)
         if sum(1 for line in data[end:].splitlines()[1:] if line.strip()) < rows:
             raise UserError(f"{path}: its header names {rows:,} rows, and it has fewer: cut short?")
     colored, mapped = "red" in names, bool(names & {*_COORDINATES})

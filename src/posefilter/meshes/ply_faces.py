@@ -77,20 +77,20 @@ def split_faces(header: str, body: bytes) -> tuple[str, bytes]:
     if _has_triangles(body, start, face, corners, order):
         return header, body
     rows, stop = _read_rows(body, start, face, order)
-    sizes = np.array([len(one[corners]) for one in rows])
-    if set(sizes.tolist()) <= {3}:
+    sizes = [len(one[corners]) for one in rows]
+    if set(sizes) <= {3}:
         return header, body
     table = np.frombuffer(body, row, vertex.rows, first)
     vertices = np.stack([table[axis] for axis in "xyz"], axis=1).astype(np.float64)
     triangles = {}
-    for size in set(sizes.tolist()) - {0, 1, 2}:
+    for size in set(sizes) - {0, 1, 2}:
         places = np.array([one[corners] for one in rows if len(one[corners]) == size], int)
         triangles[size] = iter(triangulate(vertices[places]))
     out = [
-        _take(one, triangle, len(one[corners]))
-        for one in rows
-        if len(one[corners]) > 2
-        for triangle in next(triangles[len(one[corners])]).tolist()
+        _take(one, triangle, size)
+        for one, size in zip(rows, sizes, strict=True)
+        if size > 2
+        for triangle in next(triangles[size]).tolist()
     ]
     packed = b"".join(_pack(one, face, order) for one in out)
     header = re.sub(r"^(\s*element\s+face\s+)\d+", rf"\g<1>{len(out)}", header, flags=re.MULTILINE)
