@@ -96,7 +96,7 @@ def test_a_file_of_targets_says_how_many_count(scenes: Path, tmp_path: Path) -> 
     found = evaluate(only, scenes, tmp_path / "one", str(path))
     assert found["bop"]["targets"] == 2
     assert found["bop"]["ar"] == 100
-    assert found["instances"] == 4  # the other scores are of all instances
+    assert found["instances"] == 2  # the other scores are of the targets' images, too
     wrong = [only[0]._replace(camera_from_native=shifted), only[1]]
     half = evaluate(wrong, scenes, tmp_path / "half", str(path))
     assert half["bop"]["ar"] == pytest.approx(50)
@@ -165,3 +165,44 @@ def test_estimates_of_the_meshs_frame_are_told(
     lines = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
     (warning,) = [line for line in lines if line["event"] == "warning"]
     assert warning["median_mm_in_mesh_frame"] < 0.01
+
+
+def test_of_equal_scores_the_first_estimate_counts(scenes: Path, tmp_path: Path) -> None:
+    """As the challenge's own scoring has it, whose sort is stable: methods without confidences
+    list their best estimate first.
+    """
+    rows = [row._replace(score=1.0) for row in list_truths(scenes)]
+    far = []
+    for row in rows:
+        pose = row.camera_from_native.copy()
+        pose[:3, 3] += np.array([0.0, 0.0, 5.0])
+        far.append(row._replace(camera_from_native=pose))
+    best_first = evaluate([*rows, *far], scenes, tmp_path / "first")
+    assert best_first["bop"]["ar"] == 100
+    assert best_first["missed"] == 0
+    assert best_first["add"]["recall_01d"] == 100
+    assert evaluate([*far, *rows], scenes, tmp_path / "last")["bop"]["ar"] == 0
+
+
+def test_a_file_of_targets_is_the_split_that_is_tested(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """By its name in the dataset; other images are no missed instances, and the average recall is
+    printed.
+    """
+    bop_scene(tmp_path / "bop" / "test" / "000003", [[(5, pose())], [(5, pose())], [(5, pose())]])
+    write_mesh(tmp_path / "meshes", "obj_000005")
+    target = {"scene_id": 3, "im_id": 1, "obj_id": 5, "inst_count": 1}
+    (tmp_path / "bop" / "targets.json").write_text(json.dumps([target]))
+    write_poses_csv(tmp_path / "poses.csv", [PoseRow(3, 1, 5, 1.0, pose(), 1.0)])
+    typed = [f"estimates={tmp_path / 'poses.csv'}", "targets=targets.json", "data=bop"]
+    typed += [f"data.root={tmp_path / 'bop'}", f"data.meshes={tmp_path / 'meshes'}"]
+    typed += ["data.options.split=test", "data.mesh_scale=1", f"out={tmp_path / 'out'}"]
+    assert run_command("evaluate", arguments=typed) == 0
+    found = json.loads((tmp_path / "out" / "metrics.json").read_text())
+    assert (found["instances"], found["missed"], found["bop"]["targets"]) == (1, 0, 1)
+    assert found["add"]["recall_01d"] == 100
+    assert "BOP average recall" in capfd.readouterr().out
+    wrong = [one.replace("targets.json", "none.json") for one in typed[:-1]]
+    assert run_command("evaluate", arguments=[*wrong, f"out={tmp_path / 'other'}"]) == 2
+    assert "targets=none.json: no such file, nor in data.root=" in capfd.readouterr().err

@@ -9,6 +9,7 @@ from dataset_trees import K, bop_scene, pose, scene, truth, write_png
 
 from posefilter.data.frames import NotShown
 from posefilter.data.readers.bop import BopReader
+from posefilter.data.splits import split_records
 from posefilter.errors import BadData, UserError
 from posefilter.meshes import ycb
 
@@ -160,3 +161,92 @@ def test_broken_frames_can_be_left_out_and_the_error_says_how(tmp_path):
     with pytest.raises(BadData, match=r"scene_gt.json: missing file .*data.on_error=skip leaves"):
         BopReader(tmp_path)
     assert len(BopReader(tmp_path, on_error="skip").records()) == 1
+
+
+def test_float_depth_is_in_units_of_the_depth_scale(tmp_path):
+    """As whole numbers are: millimeters with a scale of 1, meters with one of 1000."""
+    folder = tmp_path / "000001"
+    for scale in (1.0, 500.0, 1000.0):
+        bop_scene(folder, [[(5, pose())]])
+        expected = BopReader(tmp_path).read(0).depth
+        (folder / "depth" / "000000.png").unlink()
+        file = folder / "depth" / "000000.tiff"
+        assert cv2.imwrite(str(file), (1000 * expected / scale).astype(np.float32))
+        change("scene_camera.json", lambda c, s=scale: c["0"].update(depth_scale=s))(folder)
+        np.testing.assert_allclose(BopReader(tmp_path).read(0).depth, expected, rtol=1e-6)
+        file.unlink()
+
+
+@pytest.mark.parametrize("ending", ["jpeg", "JPG", "PNG", "tiff"])
+def test_images_are_found_by_any_usual_ending(tmp_path, ending):
+    folder = tmp_path / "000001"
+    bop_scene(folder, [[(5, pose())]])
+    before = folder / "rgb" / "000000.png"
+    image = cv2.imread(str(before))
+    before.unlink()
+    assert cv2.imwrite(str(before.with_suffix(f".{ending}")), image)
+    rgb = BopReader(tmp_path).read(0).rgb.astype(float)
+    assert np.abs(rgb - image[..., ::-1]).mean() < 3  # JPEG loses a little
+
+
+def test_objects_are_numbered_from_zero_and_by_whole_numbers(tmp_path):
+    """None is left out, and none takes the name of one that the list of YCB's classes ends with."""
+    bop_scene(tmp_path / "000001", [[(0, pose()), (21, FRONT)]])
+    reader = BopReader(tmp_path)
+    assert reader.objects == ("obj_000000", "obj_000021")
+    ycb_names = BopReader(tmp_path, mesh_frame="original", objects=["061_foam_brick"])
+    assert [record.obj_id for record in ycb_names.records()] == [21]
+    for wrong in (-1, 1.7):
+        change("scene_gt.json", lambda c, n=wrong: c["0"][0].update(obj_id=n))(tmp_path / "000001")
+        with pytest.raises(
+            BadData, match=r"scene_gt.json: '0\[0\].obj_id' should be a whole number"
+        ):
+            BopReader(tmp_path)
+
+
+def test_numbers_of_images_may_be_padded_in_either_file(tmp_path):
+    bop_scene(tmp_path / "000001", [[(5, pose())]])
+    change("scene_camera.json", lambda c: c.update({"000000": c.pop("0")}))(tmp_path / "000001")
+    assert BopReader(tmp_path).read(0).depth.any()
+
+
+def test_what_is_missing_is_told_with_what_writes_it(tmp_path):
+    bop_scene(tmp_path / "000001", [[(5, pose())]])
+    (tmp_path / "000001" / "mask_visib" / "000000_000000.png").unlink()
+    with pytest.raises(BadData, match=r"missing file \(bop_toolkit's scripts/calc_gt_masks\.py"):
+        BopReader(tmp_path).read(0)
+    (tmp_path / "000001" / "scene_gt.json").unlink()
+    with pytest.raises(UserError, match=r"is the ground truth of this split public\?"):
+        BopReader(tmp_path)
+
+
+def test_broken_frames_of_one_kind_are_counted_as_one_cause(tmp_path):
+    bop_scene(tmp_path / "000001", [[(5, pose())]] * 4)
+    for image in ("0", "2", "3"):
+        spoil = change("scene_gt.json", lambda c, i=image: c[i][0].update(cam_t_m2c=[1, 2]))
+        spoil(tmp_path / "000001")
+    reader = BopReader(tmp_path, on_error="skip")
+    assert dict(reader.skipped) == {"'cam_t_m2c' has the wrong size": 3}
+
+
+@pytest.mark.parametrize("typed", ["1", "obj_1", "obj_01"])
+def test_a_number_that_is_not_padded_is_told_as_it_is_written(tmp_path, typed):
+    bop_scene(tmp_path / "000001", [[(1, pose()), (13, FRONT)]])
+    with pytest.raises(UserError, match="did you mean 'obj_000001'"):
+        BopReader(tmp_path, typed)
+
+
+def test_a_list_for_detection_selects_whole_images(tmp_path):
+    bop_scene(tmp_path / "000001", [[(1, pose()), (2, FRONT)], [(1, pose())], [(2, pose())]])
+    records = BopReader(tmp_path).records()
+    one = [{"scene_id": 1, "im_id": 0}, {"scene_id": 1, "im_id": 1, "obj_id": 1, "inst_count": 1}]
+    (tmp_path / "list.json").write_text(json.dumps(one))
+    parts = split_records(records, {"test": "list.json"}, 0, tmp_path)
+    assert [(records[i].im_id, records[i].obj_id) for i in parts["test"]] == [
+        (0, 1),
+        (0, 2),
+        (1, 1),
+    ]
+    (tmp_path / "list.json").write_text('[{"scene_id": 1}]')
+    with pytest.raises(UserError, match="not a list of BOP targets"):
+        split_records(records, {"test": "list.json"}, 0, tmp_path)

@@ -11,7 +11,7 @@ import scipy.io
 from dataset_trees import K, bop_scene, fat_tree, pose, write_mesh, ycb_frame
 
 from posefilter.checking.check import check_dataset
-from posefilter.cli.evaluate import check_bop_model
+from posefilter.cli.evaluate import object_to_judge
 from posefilter.data.module import PoseDataModule
 from posefilter.data.readers.bop import BopReader
 from posefilter.data.readers.decode import holds_meters, read_depth
@@ -405,24 +405,29 @@ def test_a_list_beside_the_default_fractions_is_told(tmp_path):
 
 
 def test_a_dataset_that_is_not_ycb_v_has_no_object_of_ycb_by_its_number(tmp_path):
+    """Whether a checkpoint is tested on it, poses are scored on it, or it is trained on."""
     name = "003_cracker_box"
     bop_scene(tmp_path / "test" / "000001", [[(2, pose())]])
     write_mesh(tmp_path / "meshes", name)
     options = {"meshes": tmp_path / "meshes", "workers": 0, "progress": False}
     data = PoseDataModule("bop", tmp_path / "test", name, split={"test": 1.0}, **options)
     data.setup("test")
-    own = data.object_model(0)
-    check_bop_model(data, own)  # nothing is known of the dataset's models
+    own = data.object_model(0)  # nothing is known of the dataset's models
     (tmp_path / "models").mkdir()
     info = tmp_path / "models" / "models_info.json"
     info.write_text(json.dumps({"2": {"diameter": 1000 * own.diameter + 1}}))
-    check_bop_model(data, own)
+    data.object_model(0)
     for content in ({name: {"symmetries_discrete": []}}, {"2": {"symmetries_discrete": []}}):
         info.write_text(json.dumps(content))
-        check_bop_model(data, own)  # no diameter to compare
+        data.object_model(0)  # no diameter to compare
     info.write_text(json.dumps({"2": {"diameter": 120.0}}))
-    with pytest.raises(UserError, match=rf"object 2 has a diameter of 120 mm, and {name}"):
-        check_bop_model(data, own)
+    refused = rf"object 2 has a diameter of 120 mm, and {name}"
+    with pytest.raises(UserError, match=refused):
+        data.object_to_learn()
+    with pytest.raises(UserError, match=refused):
+        object_to_judge(data, own)
+    own_models = PoseDataModule("bop", tmp_path / "test", "obj_000002", **options)
+    own_models.reader.check_diameter("obj_000002", own.diameter)  # the dataset's own mesh
 
 
 def test_instances_of_one_image_are_counted_as_such(tmp_path, caplog):

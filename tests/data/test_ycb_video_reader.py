@@ -83,6 +83,20 @@ def test_a_list_of_key_frames_chooses_and_counts_what_is_not_there(root):
         YCBVideoReader(root, NAME, frames="other.txt")
 
 
+def test_a_list_may_name_a_frame_twice_and_rendered_frames(root):
+    lines = "0048/000002\n0048/000002\ndata_syn/000123\n"
+    (root / "image_sets" / "both.txt").write_text(lines)
+    reader = YCBVideoReader(root, NAME, frames="both.txt")
+    assert [r.name for r in reader.records()] == ["0048/000002"]
+    (note,) = reader.notes
+    assert "data.options.subsets=[data,data_syn] reads those" in note
+    both = YCBVideoReader(root, NAME, frames="both.txt", subsets=["data", "data_syn"])
+    assert [r.name for r in both.records()] == ["0048/000002", "data_syn/000123"]
+    (root / "image_sets" / "both.txt").write_text("data_syn/000123\n")
+    with pytest.raises(UserError, match=r"none of its 1 frames .*subsets=\[data,data_syn\]"):
+        YCBVideoReader(root, NAME, frames="both.txt")
+
+
 def test_listed_but_not_in_the_label(root):
     ycb_frame(root / "data" / "0051" / "000001", [(2, pose())], NATIVE, unlabeled=5)
     reader = YCBVideoReader(root, ["006_mustard_bottle"])

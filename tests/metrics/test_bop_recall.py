@@ -56,7 +56,10 @@ def test_targets_are_read_as_written(tmp_path: Path) -> None:
     targets = [Target(48, 1, 5, 1), Target(48, 36, 14, 3)]
     content = json.dumps([one._asdict() for one in targets])
     (tmp_path / "targets.json").write_text(content)
-    assert read_targets(tmp_path / "targets.json") == targets
+    path = tmp_path / "targets.json"
+    assert read_targets(str(path), tmp_path / "none") == (path, targets)
+    assert read_targets("targets.json", tmp_path) == (path, targets)  # in the dataset's folder
+    assert read_targets("targets.json", tmp_path / "test") == (path, targets)  # or a split's
 
 
 @pytest.mark.parametrize(
@@ -65,6 +68,7 @@ def test_targets_are_read_as_written(tmp_path: Path) -> None:
         ("{", "not readable as JSON"),
         ("{}", "a list of targets"),
         ('[{"scene_id": 1, "im_id": 2, "obj_id": 3}]', "entry 0: scene_id"),
+        ('[{"scene_id": 1, "im_id": 2}]', "entry 0: names an image and no object"),
         ('[{"scene_id": 1, "im_id": 2, "obj_id": 3, "inst_count": 0}]', "inst_count=0"),
         ('[{"scene_id": 1, "im_id": true, "obj_id": 3, "inst_count": 1}]', "whole numbers"),
         (
@@ -78,7 +82,7 @@ def test_other_files_are_refused_in_one_line(content: str, told: str, tmp_path: 
     path = tmp_path / "targets.json"
     path.write_text(content)
     with pytest.raises(UserError, match=told) as caught:
-        read_targets(path)
+        read_targets(str(path), tmp_path)
     assert "\n" not in str(caught.value)
     with pytest.raises(UserError, match="no such file"):
-        read_targets(tmp_path / "none.json")
+        read_targets("none.json", tmp_path)

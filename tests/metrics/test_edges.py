@@ -199,7 +199,8 @@ def test_results_are_read_as_written_with_or_without_a_header(tmp_path: Path) ->
     whole = read_poses_csv(file)
     assert len(whole) == 2
     np.testing.assert_array_equal(whole[0].camera_from_native, pose)
-    for text in ("\n".join(lines[1:]), "\ufeff" + "\n\n".join(lines)):
+    upper = [lines[0].upper(), *lines[1:], "   "]
+    for text in ("\n".join(lines[1:]), "\ufeff" + "\n\n".join(lines), "\n".join(upper)):
         file.write_text(text)
         again = read_poses_csv(file)
         assert len(again) == 2

@@ -11,7 +11,7 @@ from posefilter.metrics.registry import HIGHER, LOWER, METRICS, NEITHER, MetricI
 
 every = pytest.mark.parametrize("info", METRICS.values(), ids=METRICS.keys())
 
-STORED_AS_PERCENT = r"auc$|recall|/ar$|coverage|score$"
+STORED_AS_PERCENT = r"auc$|recall|/ar$|/ar_|coverage|score$"
 WITHIN_ONE = r"iou$|auroc"  # from 0 to 1
 WITHIN_SIGNED_ONE = r"cosine$|_r2$|heading$"  # from -1 to 1
 COUNTS = (

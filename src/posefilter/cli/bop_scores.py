@@ -5,7 +5,6 @@ them.
 from collections.abc import Sequence
 from contextlib import suppress
 from functools import cache, partial
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -21,12 +20,11 @@ from posefilter.meshes.mesh import Mesh, hull_vertices
 from posefilter.metrics.bop import REFERENCE_WIDTH, mspd, mssd
 from posefilter.metrics.bop_recall import TargetErrors, compute_average_recall
 from posefilter.metrics.bop_results import PoseRow, to_mesh
-from posefilter.metrics.bop_targets import Target, read_targets
+from posefilter.metrics.bop_targets import Target
 from posefilter.metrics.matching import match_greedily
 from posefilter.metrics.vsd import vsd
 from posefilter.rendering.embree import EmbreeRenderer, render_depth
 
-ALL = "all"  # targets: every instance that is visible enough
 _VISIBLE = 0.1  # the least visibility of a target, as the challenge has it
 Key = tuple[int, int, int]  # scene_id, im_id, obj_id
 
@@ -65,13 +63,16 @@ def assign_estimates(
 
 
 def score_targets(
-    rows: Sequence[PoseRow], selection: str, records: Sequence[FrameRecord], data: PoseDataModule
+    rows: Sequence[PoseRow],
+    targets: Sequence[Target] | None,
+    records: Sequence[FrameRecord],
+    data: PoseDataModule,
 ) -> dict[str, Any]:
     """Return the average recall of estimates.
 
     Args:
         rows: The estimates.
-        selection: A file of targets, or "all": of `records`, those of visibility 0.1 or more.
+        targets: What is to be found; None: of `records`, all of visibility 0.1 or more.
         records: The instances that are tested.
         data: Their dataset, with the meshes of its objects.
 
@@ -81,9 +82,8 @@ def score_targets(
     Raises:
         UserError: A target is not in the data, or an object has no mesh.
     """
-    groups = _group(data.reader.records() if selection != ALL else records)
+    groups = _group(records if targets is None else data.reader.records())
     classes = {record.obj_id for record in data.reader.records()}
-    targets = read_targets(Path(selection)) if selection != ALL else None
     counts = None if targets is None else {one[:3]: one.inst_count for one in targets}
     place = {record.key: i for i, record in enumerate(data.reader.records())}
     by_key = _sort_rows(rows)
@@ -93,7 +93,7 @@ def score_targets(
         if key not in groups:
             names = dict(zip(Target._fields, key, strict=False))
             left_out = "" if key[2] in classes else " (data.object=null takes all objects)"
-            raise UserError(f"targets={selection}: the data have no instance of {names}{left_out}")
+            raise UserError(f"targets: the data have no instance of {names}{left_out}")
         samples = _read_shown([place[record.key] for record in groups[key]], data.reader)
         shares = [data.reader.visible_share(sample) for sample in samples]
         order = np.argsort(-np.nan_to_num(shares, nan=1.0), kind="stable").tolist()
@@ -189,8 +189,10 @@ def _group(records: Sequence[FrameRecord]) -> dict[Key, list[FrameRecord]]:
 
 
 def _sort_rows(rows: Sequence[PoseRow]) -> dict[Key, list[PoseRow]]:
-    """Return the estimates of each class in each image, the most confident first."""
+    """Return the estimates of each class in each image, the most confident first; equally
+    confident ones stay in their order.
+    """
     out: dict[Key, list[PoseRow]] = {}
-    for row in sorted(rows, key=lambda row: row.score)[::-1]:
+    for row in sorted(rows, key=lambda row: -row.score):  # of equal ones the first counts, as BOP's
         out.setdefault((row.scene_id, row.im_id, row.obj_id), []).append(row)
     return out

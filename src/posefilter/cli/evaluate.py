@@ -29,14 +29,12 @@ from posefilter.confidence.tolerance import RIGHT, read_pose_tolerance
 from posefilter.data.absent import hide_annotation
 from posefilter.data.loaders import make_loader
 from posefilter.data.module import PoseDataModule
-from posefilter.data.readers.decode import numbers
 from posefilter.errors import UserError
 from posefilter.geometry.boxes import box_of_pose
-from posefilter.limits import read_json
-from posefilter.meshes.ycb import CLASSES, ycbvideo_index
 from posefilter.metrics.apparent_size import describe_mismatch
 from posefilter.metrics.bop import BopErrors
-from posefilter.metrics.bop_results import read_poses_csv, to_mesh, write_poses_csv
+from posefilter.metrics.bop_results import PoseRow, read_poses_csv, to_mesh, write_poses_csv
+from posefilter.metrics.bop_targets import Target, read_targets
 from posefilter.metrics.collect import BoxIoU, PoseErrors
 from posefilter.metrics.errors import add
 from posefilter.metrics.image_errors import FILE as ERRORS
@@ -46,9 +44,9 @@ from posefilter.models.base import PoseEstimator
 from posefilter.paths import check_links, find_conf
 from posefilter.types import Batch, ObjectModel
 
+ALL = "all"  # targets: every instance that is visible enough
 OF_THE_CHECKPOINT = ("object", "image_width", "image_height", "batch_size_test")
 _BATCH = 8  # images without the object
-_SAME_DIAMETER = 0.05  # share by which BOP's models of YCB-V may differ from YCB's own
 _SAME_OBJECT = 0.003  # [m] by which the center and radius of two meshes of one object may differ
 
 
@@ -162,15 +160,12 @@ def _of_estimates(job: Job) -> tuple[dict[str, Any], dict[str, Path]]:
         )
     rows = read_poses_csv(Path(str(job.cfg.estimates)))
     settings = data_settings(job, {}, None)
-    if job.cfg.targets is not None and not any("data.object=" in one for one in job.overrides):
-        default = OmegaConf.load(find_conf() / "data" / "_base.yaml").object
-        if settings.object == default:
-            settings.object = None  # the targets say which objects are meant
+    targets = list_targets(job, settings)
     data = build_data(settings, job.cfg.console)
     data.setup("test")
-    best = {}
-    for row in sorted(rows, key=lambda row: row.score):
-        best[row.scene_id, row.im_id, row.obj_id] = row
+    best = dict[tuple[int, int, int], PoseRow]()
+    for row in sorted(rows, key=lambda row: -row.score):
+        best.setdefault((row.scene_id, row.im_id, row.obj_id), row)
     assigned = assign_estimates(rows, data.records("test"), data)
     if not assigned:
         raise UserError(
@@ -217,10 +212,31 @@ def _of_estimates(job: Job) -> tuple[dict[str, Any], dict[str, Path]]:
     results["seconds_per_image"] = sum(seconds) / len(seconds) if seconds else None
     results["belief"] = None
     if job.cfg.targets is not None:
-        results["bop"] = score_targets(rows, str(job.cfg.targets), data.records("test"), data)
+        results["bop"] = score_targets(rows, targets, data.records("test"), data)
     write_errors(job.folder / ERRORS, table)
     metrics = {**record(results, job, data.describe(), None), "estimates": str(job.cfg.estimates)}
     return metrics, {"errors": job.folder / ERRORS}
+
+
+def list_targets(job: Job, settings: DictConfig) -> list[Target] | None:
+    """Return what is to be found, None for all that is visible enough; unless typed otherwise, the
+    settings of the data then are those of the targets: their objects, and of a file their images.
+
+    Raises:
+        UserError: The file of targets is missing or broken.
+    """
+    if job.cfg.targets is None:
+        return None
+    if not any("data.object=" in one for one in job.overrides):
+        default = OmegaConf.load(find_conf() / "data" / "_base.yaml").object
+        if settings.object == default:
+            settings.object = None  # the targets say which objects are meant
+    if str(job.cfg.targets) == ALL:
+        return None
+    path, targets = read_targets(str(job.cfg.targets), Path(str(settings.root)))
+    if not any("data.split" in one for one in job.overrides):
+        settings.split = {"test": str(path)}
+    return targets
 
 
 def warn_of_frame(own: float, other: float, console: str) -> None:
@@ -312,7 +328,7 @@ def object_to_judge(data: PoseDataModule, own: ObjectModel) -> ObjectModel:
 
     Raises UserError where its mesh there is another one: poses of the two could not be compared.
     """
-    check_bop_model(data, own)
+    data.reader.check_diameter(own.name, own.diameter)
     if not data.meshes.has(own.name):
         return own
     if data.objects != (own.name,):
@@ -335,32 +351,6 @@ def object_to_judge(data: PoseDataModule, own: ObjectModel) -> ObjectModel:
         symmetries=theirs.symmetries,
         parts=theirs.parts,
     )
-
-
-def check_bop_model(data: PoseDataModule, own: ObjectModel) -> None:
-    """Raise UserError where a dataset in BOP's format has another object by the number that one of
-    YCB's has in YCB-V, as the diameter in its `models_info.json` tells.
-    """
-    if data.source != "bop" or own.name not in CLASSES:
-        return
-    roots = [Path(str(data.root)), Path(str(data.root)).parent]
-    folders = [Path(str(data.meshes.root)), *(root / "models" for root in roots)]
-    files = (folder / "models_info.json" for folder in folders)
-    file = next((one for one in files if one.is_file()), None)
-    if file is None:
-        return
-    number = ycbvideo_index(own.name)
-    content = read_json(file)
-    entry = content.get(str(number)) if isinstance(content, dict) else None
-    if not (isinstance(entry, dict) and "diameter" in entry):  # nothing to compare
-        return
-    theirs = 0.001 * float(numbers(entry, "diameter", file, (), f"{number}."))
-    if abs(theirs - own.diameter) > _SAME_DIAMETER * own.diameter:
-        raise UserError(
-            f"{file}: object {number} has a diameter of {1000 * theirs:.0f} mm, and {own.name}, "
-            f"which has this number in YCB-V, {1000 * own.diameter:.0f} mm: the dataset has no "
-            f"{own.name} by it"
-        )
 
 
 def keep_training_results(folder: Path) -> None:

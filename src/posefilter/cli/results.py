@@ -14,6 +14,7 @@ from posefilter.files import open_whole
 from posefilter.metrics.registry import find_metric, read_number
 
 _ROWS = (
+    "bop/ar", "bop/ar_vsd", "bop/ar_mssd", "bop/ar_mspd",
     "add/auc", "add/recall_01d", "add/recall_2cm", "add/median_mm", "add_s/auc", "add_s/median_mm",
     "iou", "parts/box_iou", "parts/mask_iou", "particles_on_object", "seconds_per_image",
 )  # fmt: skip
@@ -24,6 +25,7 @@ _TOLD = (
     "add_s",
     "mssd",
     "mspd",
+    "bop",
     "iou",
     "parts",
     "particles_on_object",

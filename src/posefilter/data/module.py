@@ -201,7 +201,8 @@ class PoseDataModule(LightningDataModule):
         """Return a class as methods and metrics use it.
 
         Raises:
-            UserError: The dataset has photographs, and meshes are the built-in ones.
+            UserError: The dataset has photographs, and meshes are the built-in ones; or it says
+                that the object has another diameter than its mesh.
         """
         name = self.objects[object_id]
         if self.source in ("ycb_video", "bop") and str(self.meshes.root) == BUILTIN:
@@ -212,7 +213,9 @@ class PoseDataModule(LightningDataModule):
         points = read_model_points(
             self._model_points_dir, self.root, name, self.reader.native_from_mesh(name)
         )
-        return object_model(self.meshes.load(name), points=points, count=self._num_model_points)
+        found = object_model(self.meshes.load(name), points=points, count=self._num_model_points)
+        self.reader.check_diameter(name, found.diameter)
+        return found
 
     def object_to_learn(self) -> ObjectModel:
         """Return the first class as a method learns it: with the texture of its mesh.

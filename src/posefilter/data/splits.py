@@ -193,25 +193,32 @@ def _listed(records: Sequence[FrameRecord], file: str, root: Path) -> list[int]:
     if path is None:
         raise UserError(f"data.split: no such list of frames: {file} (nor below {root})")
     if path.suffix == ".json":
-        targets = {(t["scene_id"], t["im_id"], t["obj_id"]) for t in _json_list(path)}
-        chosen = [i for i, r in enumerate(records) if (r.scene_id, r.im_id, r.obj_id) in targets]
+        targets = set(_json_list(path))
+        chosen = [
+            i
+            for i, r in enumerate(records)
+            if not targets.isdisjoint({(r.scene_id, r.im_id, r.obj_id), (r.scene_id, r.im_id)})
+        ]
     else:
         lines = set(read_lines(path))
         chosen = [i for i, r in enumerate(records) if r.name in lines]
     if not chosen:
         raise UserError(
-            f"{path}: none of the frames that it lists is in {root} with the object asked for"
+            f"{path}: none of the frames that it lists is in {root} with the object asked for "
+            "(data.object=null takes all objects)"
         )
     return chosen
 
 
-def _json_list(path: Path) -> list[dict[str, int]]:
+def _json_list(path: Path) -> list[tuple[int, ...]]:
+    """Return (scene_id, im_id, obj_id) of BOP's targets, or (scene_id, im_id) where a list for
+    detection names no object.
+    """
     content = read_json(path)
     try:
         return [
-            {key: int(t[key]) for key in ("scene_id", "im_id", "obj_id")}
+            tuple(int(t[key]) for key in ("scene_id", "im_id", "obj_id")[: 2 + ("obj_id" in t)])
             for t in content
-            if {"scene_id", "im_id", "obj_id"} <= set(t)
         ]
-    except (ValueError, TypeError, OverflowError) as error:
+    except (KeyError, ValueError, TypeError, OverflowError) as error:
         raise UserError(f"{path}: not a list of BOP targets ({error})") from error

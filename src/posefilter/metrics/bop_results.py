@@ -84,7 +84,8 @@ def read_poses_csv(path: Path) -> list[PoseRow]:
     rows = []
     with path.open(newline="", encoding="utf-8", errors="replace") as file:
         for number, cells in enumerate(csv.reader(file), start=1):
-            if not cells or (number == 1 and cells[0].strip().lstrip("\ufeff") == HEADER[0]):
+            first = cells[0].strip().lstrip("\ufeff").lower() if cells else ""
+            if not any(map(str.strip, cells)) or (number == 1 and first == HEADER[0]):
                 continue
             rows.append(_parse(cells, f"{path}, line {number}"))
     away = [float(np.linalg.norm(row.camera_from_native[:3, 3])) for row in rows]

@@ -20,14 +20,23 @@ class Target(NamedTuple):
     inst_count: int
 
 
-def read_targets(path: Path) -> list[Target]:
-    """Read a file of targets.
+def read_targets(file: str, root: Path) -> tuple[Path, list[Target]]:
+    """Read a file of targets, which is also looked for in the dataset's folder and beside it.
+
+    Args:
+        file: Its path, or its name in the dataset.
+        root: The dataset's folder, or that of a split.
+
+    Returns:
+        Where it was found, and what it lists.
 
     Raises:
         UserError: There is none, or it holds something else; the message names the entry.
     """
-    if not path.is_file():
-        raise UserError(f"targets={path}: no such file")
+    candidates = (Path(file), root / file, root.parent / file)
+    path = next((one for one in candidates if one.is_file()), None)
+    if path is None:
+        raise UserError(f"targets={file}: no such file, nor in data.root={root}")
     content = read_json(path)
     if not isinstance(content, list):
         raise UserError(
@@ -36,10 +45,15 @@ def read_targets(path: Path) -> list[Target]:
     targets = [_read_one(one, f"targets={path}, entry {i}") for i, one in enumerate(content)]
     if len({one[:3] for one in targets}) < len(targets):
         raise UserError(f"targets={path}: names a class of an image twice")
-    return targets
+    return path, targets
 
 
 def _read_one(one: Any, where: str) -> Target:
+    if isinstance(one, dict) and "im_id" in one and "obj_id" not in one:
+        raise UserError(
+            f"{where}: names an image and no object, as lists for detection do; to score poses "
+            "give test_targets_bop19.json, or targets=all"
+        )
     if not isinstance(one, dict) or not all(type(one.get(key)) is int for key in _KEYS):
         raise UserError(f"{where}: {', '.join(_KEYS)} should be whole numbers")
     if one["inst_count"] < 1:

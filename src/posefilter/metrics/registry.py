@@ -155,6 +155,10 @@ _METRICS = (
     *_describe_errors("add_s", "ADD-S"),
     *_describe_bop("mssd", "mm", "0.05 to 0.5 diameters, as in the BOP challenge"),
     *_describe_bop("mspd", "px", "5 to 50 pixels in an image 640 wide"),
+    _percent("bop/ar", "BOP average recall", ".1f", HIGHER, meaning="mean of VSD, MSSD and MSPD"),
+    _percent("bop/ar_vsd", "BOP recall by VSD", ".1f", HIGHER),
+    _percent("bop/ar_mssd", "BOP recall by MSSD", ".1f", HIGHER),
+    _percent("bop/ar_mspd", "BOP recall by MSPD", ".1f", HIGHER),
     _unit("iou", "box IoU"),
     _unit(
         "parts/box_iou",

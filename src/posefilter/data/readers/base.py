@@ -1,5 +1,6 @@
 """What all readers share: counting what they leave out, and asking meshes about masks."""
 
+import re
 from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
@@ -13,6 +14,8 @@ from posefilter.data.silhouette import Geometry
 from posefilter.errors import BadData
 from posefilter.meshes.store import BUILTIN, MeshStore
 from posefilter.paths import check_inside
+
+_PLACE = re.compile(r"(?<=')[0-9]+(\[[0-9]+\])?\.|\[[0-9]+\]")  # of a key, in its file
 
 
 class BaseReader:
@@ -53,6 +56,9 @@ class BaseReader:
         """
         raise NotImplementedError
 
+    def check_diameter(self, name: str, diameter: float) -> None:
+        """Raise UserError where the dataset says that an object has another diameter [m]."""
+
     def visible_share(self, sample: Sample) -> float:
         """Measure the visibility of a sample, at whatever resolution; NaN where no mesh fits."""
         if self._geometry is None:
@@ -72,8 +78,9 @@ class BaseReader:
             told = [error.detail] if error.detail else []
             advice = "data.on_error=skip leaves such frames out"
             raise BadData(error.path, error.cause, "; ".join([*told, advice])) from error
-        self.skipped[error.cause] += 1
-        self.examples.setdefault(error.cause, str(error))
+        cause = _PLACE.sub("", error.cause)  # else each frame would have a cause of its own
+        self.skipped[cause] += 1
+        self.examples.setdefault(cause, str(error))
 
     def _drop_absent(self) -> None:
         """Leave out classes of which no image shows any."""

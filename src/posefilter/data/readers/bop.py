@@ -20,6 +20,7 @@ from posefilter.data.readers.decode import (
     read_color,
     read_depth,
     read_label,
+    whole_number,
 )
 from posefilter.data.readers.naming import choose_objects, need_text
 from posefilter.data.readers.plausible import check_camera, check_units
@@ -31,7 +32,10 @@ from posefilter.meshes.store import MeshStore
 from posefilter.paths import check_inside
 
 MM = 0.001  # meters a millimeter
-_ENDINGS = ("png", "jpg", "tif")  # ITODD's images are TIFF
+_ENDINGS = ("png", "jpg", "tif", "jpeg", "tiff", "PNG", "JPG", "TIF", "JPEG", "TIFF")
+_DEPTH_ENDINGS = ("png", "tif", "tiff", "PNG", "TIF", "TIFF")  # ITODD's images are TIFF
+_INFO = "models_info.json"
+_SAME_DIAMETER = 0.05  # share by which BOP's models of YCB-V may differ from YCB's own
 _IMAGE = _SCENE = re.compile(r"[0-9]{1,9}")
 # Center of the bounding box of YCB-Video's models [m]: the origin of BOP's YCB-V models, which are
 # not turned.
@@ -116,6 +120,11 @@ class BopReader(BaseReader):
                 f"{base}: no BOP scenes here: no <scene>/scene_gt.json (data.root, "
                 f"data.options.split={'|'.join(splits) or '...'})"
             )
+        if not any((folder / "scene_gt.json").exists() for folder in folders):
+            raise UserError(
+                f"{folders[0]}: has no scene_gt.json, nor has any other scene of {base}: is the "
+                "ground truth of this split public? (data.options.split)"
+            )
         scenes = [(folder, self._read_scene(folder)) for folder in folders]
         wanted = [objects] if isinstance(objects, str) else objects
         self._by_ycb_name = (
@@ -129,13 +138,13 @@ class BopReader(BaseReader):
         numbers_seen = {
             int(one["obj_id"]) for _, scene in scenes for gt in scene[0].values() for one in gt
         }
-        known = sorted(self._name(n) for n in numbers_seen if n > 0)
+        known = sorted(map(self._name, numbers_seen))
         try:
             self.objects = choose_objects(wanted, known, base)
         except UserError as error:
             if not self._by_ycb_name:
                 raise
-            own = ", ".join(f"obj_{n:06d}" for n in sorted(numbers_seen) if n > 0)
+            own = ", ".join(f"obj_{n:06d}" for n in sorted(numbers_seen))
             raise UserError(
                 f"{base}: its scenes have no '{', '.join(map(str, wanted or []))}' (data.object), "
                 f"YCB-V's name of a number; they have {own}; data.object=null takes all"
@@ -159,6 +168,29 @@ class BopReader(BaseReader):
             out[:3, 3] -= _YCBV_CENTERS[name]
         return out
 
+    def check_diameter(self, name: str, diameter: float) -> None:
+        """Raise UserError where a dataset that is not YCB-V has another object by the number that
+        one of YCB's has there, as the diameter in its `models_info.json` tells.
+        """
+        if self._mesh_frame != "original" or name not in ycb.CLASSES:
+            return
+        roots = [self.root / "models", self.root.parent / "models"]
+        if self._geometry is not None:
+            roots.insert(0, Path(str(self._geometry.meshes.root)))
+        file = next((root / _INFO for root in roots if (root / _INFO).is_file()), None)
+        number = ycb.ycbvideo_index(name)
+        content = None if file is None else read_json(file)
+        entry = content.get(str(number)) if isinstance(content, dict) else None
+        if file is None or not (isinstance(entry, dict) and "diameter" in entry):
+            return  # nothing to compare
+        theirs = MM * float(numbers(entry, "diameter", file, (), f"{number}."))
+        if abs(theirs - diameter) > _SAME_DIAMETER * diameter:
+            raise UserError(
+                f"{file}: object {number} has a diameter of {1000 * theirs:.0f} mm, and {name}, "
+                f"which has this number in YCB-V, {1000 * diameter:.0f} mm: the dataset has no "
+                f"{name} by it"
+            )
+
     def read(self, i: int) -> Sample:
         """Return record i at the dataset's resolution, its visibility still unknown.
 
@@ -167,10 +199,14 @@ class BopReader(BaseReader):
         entry = self._entries[i]
         color_path, depth_path, mask_path, gt_path, camera_path = self._files(entry.record)
         check_camera(entry.K, camera_path)
+        if not mask_path.is_file():
+            advice = "bop_toolkit's scripts/calc_gt_masks.py writes the masks"
+            raise BadData(mask_path, "missing file", advice)
         label = read_label(mask_path)
         if ((label != 0) & (label != label.max())).any():
             raise BadData(mask_path, "no mask", "more than two values; is it the depth?")
-        rgb, depth, mask = read_color(color_path), read_depth(depth_path, entry.units), label > 0
+        rgb, mask = read_color(color_path), label > 0
+        depth = read_depth(depth_path, entry.units, scaled_floats=True)
         height, width = rgb.shape[:2]
         expect_size(depth_path, depth, height, width, color_path.name)
         expect_size(mask_path, mask, height, width, color_path.name)
@@ -190,7 +226,7 @@ class BopReader(BaseReader):
         return out & ~mask
 
     def _name(self, number: int) -> str:
-        if self._by_ycb_name and number <= len(ycb.CLASSES):
+        if self._by_ycb_name and 1 <= number <= len(ycb.CLASSES):
             return ycb.CLASSES[number - 1]
         return f"obj_{number:06d}"
 
@@ -211,8 +247,8 @@ class BopReader(BaseReader):
             for image in truth:
                 path = folder / "scene_gt.json"
                 for k, one in enumerate(need_list(truth, image, path)):
-                    numbers(one, "obj_id", path, (), f"{image}[{k}].")
-            return truth, cameras
+                    whole_number(one, "obj_id", path, f"{image}[{k}].")
+            return truth, {str(int(image)): camera for image, camera in cameras.items()}
         except BadData as error:
             self._leave_out(error)
             return {}, {}
@@ -237,17 +273,17 @@ class BopReader(BaseReader):
     ) -> list[_Entry]:
         gt_path, camera_path = folder / "scene_gt.json", folder / "scene_camera.json"
         stem = f"{int(image):06d}"
-        camera = need(cameras, image, camera_path)
+        camera = need(cameras, str(int(image)), camera_path)  # either may be written as 000003
         K = numbers(camera, "cam_K", camera_path, (3, 3), f"{image}.")
         scale = float(numbers(camera, "depth_scale", camera_path, (), f"{image}."))
         check_units(1 / (scale * MM) if scale > 0 else scale, camera_path, f"{image}.depth_scale")
         masks = [folder / "mask_visib" / f"{stem}_{k:06d}.png" for k in range(len(truth))]
         color = _color(folder, stem)
-        depth = _first(folder / "depth" / f"{stem}.{end}" for end in ("png", "tif"))
+        depth = _first(folder / "depth" / f"{stem}.{end}" for end in _DEPTH_ENDINGS)
         entries = []
         for k, one in enumerate(truth):
             where = f"{image}[{k}]."
-            number = int(numbers(one, "obj_id", gt_path, (), where))
+            number = whole_number(one, "obj_id", gt_path, where)
             name = self._name(number)
             if name not in self.objects:
                 continue

@@ -29,13 +29,14 @@ def read_color(path: Path) -> np.ndarray:
     return np.ascontiguousarray(image[..., 2::-1])
 
 
-def read_depth(path: Path, units: float) -> np.ndarray:
+def read_depth(path: Path, units: float, scaled_floats: bool = False) -> np.ndarray:
     """Read a depth image, or an array of depths (`.npy`).
 
     Args:
         path: A 16-bit image, or an array (H, W) of whole numbers, in `units`; or an image (TIFF) or
             array of floats, in meters.
         units: Units of whole numbers a meter.
+        scaled_floats: Floats are in `units`, too, as BOP's `depth_scale` has it.
 
     Returns:
         Depth (H, W) float32 [m], 0 where unknown: saturated pixels count as that, and floats that
@@ -54,7 +55,7 @@ def read_depth(path: Path, units: float) -> np.ndarray:
             raise BadData(path, "depth is negative", f"{image.min()}")
         if (image > np.finfo(np.float32).max).any():
             raise BadData(path, "depth is too large", f"{image.max()}")
-        if image.dtype.kind == "f":
+        if image.dtype.kind == "f" and not scaled_floats:
             return image.astype(np.float32)
     elif image.dtype != np.uint16 or image.ndim != 2:
         raise BadData(
@@ -129,6 +130,14 @@ def numbers(
     if not np.isfinite(array).all():
         raise BadData(path, f"'{where}{key}' holds NaN or infinity")
     return array.reshape(shape)
+
+
+def whole_number(record: Any, key: str, path: Path, where: str = "") -> int:
+    """Return record[key], a whole number of 0 or more.  Raises BadData where it is none."""
+    value = float(numbers(record, key, path, (), where))
+    if value < 0 or value != int(value):
+        raise BadData(path, f"'{where}{key}' should be a whole number, 0 or more", f"{value:g}")
+    return int(value)
 
 
 def expect_size(path: Path, image: np.ndarray, height: int, width: int, of: str) -> None:

@@ -10,7 +10,13 @@ from typing import Any
 import numpy as np
 import torch
 
-from posefilter.data.readers.decode import list_folder, need, need_list, numbers
+from posefilter.data.readers.decode import (
+    list_folder,
+    need,
+    need_list,
+    numbers,
+    whole_number,
+)
 from posefilter.errors import BadData, UserError
 from posefilter.geometry.pose import is_rigid
 from posefilter.geometry.rotation import matrix_from_quat_xyzw
@@ -95,7 +101,7 @@ def object_settings(path: Path) -> dict[str, FatClass]:
         size = None
         if "cuboid_dimensions" in one:
             size = numbers(one, "cuboid_dimensions", path, (3,), where) * CM
-        seg_id = int(numbers(one, "segmentation_class_id", path, (), where))
+        seg_id = whole_number(one, "segmentation_class_id", path, where)
         classes[mesh_name(need(one, "class", path, where), path)] = FatClass(seg_id, aligned, size)
     return classes
 
@@ -112,7 +118,7 @@ def camera_settings(path: Path) -> dict[str, FatCamera]:
         )
         size = need(one, "captured_image_size", path, where)
         width, height = (
-            int(numbers(size, key, path, (), f"{where}captured_image_size."))
+            whole_number(size, key, path, f"{where}captured_image_size.")
             for key in ("width", "height")
         )
         skew = 0.0

@@ -1,10 +1,13 @@
 """Find the classes that a user names among those that a dataset has."""
 
 import difflib
+import re
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from posefilter.errors import UserError
+
+_BOP_NAME = re.compile(r"(?:obj_?)?0*([0-9]{1,6})")  # of one who leaves out what pads it
 
 
 def choose_objects(
@@ -24,7 +27,10 @@ def choose_objects(
     names = tuple(strip(str(name)) for name in listed)
     for name in names:
         if name not in known:
-            near = difflib.get_close_matches(name, known, n=1, cutoff=0.5)
+            number = _BOP_NAME.fullmatch(name)
+            meant = f"obj_{int(number[1]):06d}" if number else ""
+            near = [meant] if meant in known else []
+            near = near or difflib.get_close_matches(name, known, n=1, cutoff=0.5)
             hint = f"did you mean '{near[0]}'?" if near else f"it has {', '.join(known) or 'none'}"
             raise UserError(f"{root}: unknown class '{name}' (data.object): {hint}")
     if not names:

@@ -178,7 +178,7 @@ class YCBVideoReader(BaseReader):
                 for scene, folder in sorted(folders.items())
                 for stem in sorted(list_stems(folder))
             ]
-        missing = 0
+        missing = unread = 0
         for name in names:
             scene, stem = name.rsplit("/", 1)
             if not FRAME.fullmatch(stem):
@@ -188,6 +188,7 @@ class YCBVideoReader(BaseReader):
                 )
             if scene not in folders:
                 missing += 1
+                unread += scene == SYNTHETIC and (self.root / SYNTHETIC).is_dir()
                 continue
             scene_id = (
                 _SYN_SCENE + int(stem) // _SYN_BLOCK
@@ -195,12 +196,16 @@ class YCBVideoReader(BaseReader):
                 else int("".join(c for c in scene if c in "0123456789")[:9] or 0)
             )
             yield scene_id, int(stem), name, folders[scene] / stem
+        advice = "data.options.subsets=[data,data_syn] reads those of data_syn"
         if missing == len(names):
             raise UserError(
                 f"{listed or self.root}: none of its {missing} frames is in {self.root}"
+                + (f"; {advice}" if unread else "")
             )
-        if missing:
-            self.notes[f"frames in {listed} whose scenes are not in {self.root}"] = missing
+        if unread:
+            self.notes[f"frames of data_syn in {listed} are left out: {advice}"] = unread
+        if missing > unread:
+            self.notes[f"frames in {listed} whose scenes are not in {self.root}"] = missing - unread
 
     def _list_frame(self, scene_id: int, im_id: int, name: str, stem: Path) -> list[_Entry]:
         path = stem.with_name(f"{stem.name}-meta.mat")

@@ -78,7 +78,7 @@ def read_frame_list(root: Path, listed: str | Path) -> list[str]:
     names = read_lines(path, _LONGEST_LIST)
     if not names or any("/" not in name for name in names):
         raise UserError(f"{path}: not a list of frames; expected lines such as 0048/000001")
-    return names
+    return [*dict.fromkeys(names)]  # a frame that is listed twice is read once
 
 
 def _check_packed(content: bytes) -> None:
@@ -106,6 +106,8 @@ def read_meta(path: Path) -> dict[str, Any]:
     try:
         _check_packed(content)
         meta = scipy.io.loadmat(data, variable_names=_KEYS)
+    except NotImplementedError as error:  # of version 7.3, which is HDF5
+        raise BadData(path, "a MATLAB file of version 7.3", "save it with -v7") from error
     except Exception as error:  # the file decides what breaks: the parser raises anything
         raise BadData(path, "not readable as a MATLAB file", f"truncated? {error}") from error
     for key in _KEYS:
