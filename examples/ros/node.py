@@ -8,7 +8,6 @@ how to install both.  The tests run it with stand-ins for ROS's packages.
         -r depth:=/camera/aligned_depth_to_color/image_raw
 """
 
-import math
 from collections import Counter
 from contextlib import suppress
 from queue import Empty, Queue
@@ -27,7 +26,13 @@ from vision_msgs.msg import BoundingBox3D, Detection3D, Detection3DArray, Object
 
 import posefilter
 from posefilter.result import Result
-from posefilter.ros.detections import list_shown, make_quaternion, measure_box, to_ros_covariance
+from posefilter.ros.detections import (
+    choose_score,
+    list_shown,
+    make_quaternion,
+    measure_box,
+    to_ros_covariance,
+)
 from posefilter.ros.messages import decode_color, decode_depth, decode_intrinsics
 
 _WAITING = 10  # messages of a topic that wait for those of the others: depth may come frames later
@@ -88,6 +93,16 @@ class PoseNode(Node):
         except posefilter.UserError as error:  # of this image; the next may be as it should be
             self.get_logger().error(str(error), throttle_duration_sec=_SILENCE)
             return
+        frames = {one.header.frame_id for one in (color, depth, camera)} - {""}
+        if len(frames) > 1:
+            self.get_logger().warning(
+                f"color, depth and camera_info are of the frames {', '.join(sorted(frames))}: is "
+                "depth aligned to the color?",
+                throttle_duration_sec=_SILENCE,
+            )
+        for one in results:
+            if one.wrong_size or one.blank:
+                self.get_logger().warning("; ".join(one.warnings), throttle_duration_sec=_SILENCE)
         shown = [make_detection(one, color.header) for one in list_shown(results)]
         if self.context.ok():  # it may have been shut down meanwhile
             self.publisher.publish(Detection3DArray(header=color.header, detections=shown))
@@ -115,7 +130,7 @@ def make_detection(result: Result, header: object) -> Detection3D:
     covariance = to_ros_covariance(belief.covariance_about(result.pose), result.pose, belief.center)
     found = ObjectHypothesisWithPose()
     found.hypothesis.class_id = result.object
-    found.hypothesis.score = math.nan if result.probability is None else result.probability
+    found.hypothesis.score = choose_score(result)
     found.pose = PoseWithCovariance(
         pose=make_pose(result.pose), covariance=covariance.reshape(36).tolist()
     )

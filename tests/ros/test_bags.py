@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import math
 import os
 import signal
 import struct
@@ -384,7 +385,7 @@ def test_a_part_of_a_raw_image_is_rectified_about_its_own_axis() -> None:
 @pytest.mark.parametrize(
     "broken",
     [
-        {"encoding": "yuv422"}, {"data": np.zeros(3, np.uint8)}, {"step": 2}, {"width": 0},
+        {"encoding": "bayer_rggb16"}, {"data": np.zeros(3, np.uint8)}, {"step": 2}, {"width": 0},
         {"height": 2**31},
     ],
 )  # fmt: skip
@@ -495,11 +496,17 @@ def test_mistakes_are_one_line(tmp_path: Path, capfd) -> None:
     broken = tmp_path / "broken.mcap"
     broken.write_bytes(bag.read_bytes()[: bag.stat().st_size // 2])
     (tmp_path / "there.mcap").write_text("mine")
+    (tmp_path / "killed").mkdir()
+    (tmp_path / "killed" / "killed_0.mcap").write_bytes(bag.read_bytes())
+    (tmp_path / "old.bag").write_bytes(b"#ROSBAG V2.0\n" + bytes(4096))
     cases = [
         ([str(bag)], ["color=/nothing"], "/rgb (sensor_msgs/msg/Image)"),
         ([str(bag)], ["color=/info"], "has type sensor_msgs/msg/CameraInfo"),
-        ([str(bag)], [], "no color image has depth within max_time_difference=0.01"),
-        ([str(broken)], [], "bag="),
+        ([str(bag)], [], "within max_time_difference=0.01 s; the nearest is 0.05 s away"),
+        ([str(bag)], ["on_error=maybe"], "choose raise or skip"),
+        ([str(broken)], [], "it was cut off; `mcap recover` saves"),
+        ([str(tmp_path / "killed")], [], "it has no metadata.yaml, as after a recorder that was"),
+        ([str(tmp_path / "old.bag")], [], "it is of ROS 1"),
         ([str(tmp_path / "no.mcap")], [], "no such file"),
         ([str(bag), str(tmp_path / "there.mcap")], [], "already exists"),
         ([str(bag)], ["track=maybe"], "choose true or false"),
@@ -595,3 +602,131 @@ def test_progress_counts_every_color_image(
     typed = [str(bag), str(tmp_path / "out.mcap"), f"checkpoint={NAME}", *TYPED, *FEW]
     assert run_command("convert_bag", HOME, typed) == 0
     assert [(one.completed, one.total) for one in seen] == [(2, 2)]
+
+
+def test_mosaics_and_yuv_become_color() -> None:
+    """A flat color in each layout; a mosaic's rows begin as its name does."""
+    red, green, blue = 200, 120, 40
+    flat = np.full((8, 8, 3), (red, green, blue), np.uint8)
+    of = {"r": red, "g": green, "b": blue}
+    for letters in ("rggb", "bggr", "gbrg", "grbg"):
+        tile = np.array([of[letter] for letter in letters], np.uint8).reshape(2, 2)
+        mosaic, name = np.tile(tile, (4, 4)), f"bayer_{letters}8"
+        np.testing.assert_array_equal(decode_color(make_image(mosaic, name), "/c"), flat)
+        png = cv2.imencode(".png", mosaic)[1].tobytes()
+        packed = make_compressed(f"{name}; png compressed ", png)
+        np.testing.assert_array_equal(decode_color(packed, "/c"), flat)
+        color = cv2.imencode(".png", flat[..., ::-1])[1].tobytes()  # as image_transport packs it
+        packed = make_compressed(f"{name}; png compressed bgr8", color)
+        np.testing.assert_array_equal(decode_color(packed, "/c"), flat)
+    red_blue = 0.299 * red + 0.587 * green + 0.114 * blue  # BT.601, of 16 to 235 and 16 to 240
+    y = 16 + 219 / 255 * red_blue
+    u = 128 + 112 / 255 * (blue - red_blue) / 0.886
+    v = 128 + 112 / 255 * (red - red_blue) / 0.701
+    yuyv = np.tile(np.array([[y, u], [y, v]]).round().astype(np.uint8), (8, 4, 1))
+    for name, packed in (("yuv422_yuy2", yuyv), ("yuv422", yuyv[..., ::-1])):
+        message = make_image(np.ascontiguousarray(packed), name)
+        assert np.abs(decode_color(message, "/c").astype(int) - flat).max() <= 2
+    with pytest.raises(UserError, match="of an odd width"):
+        decode_color(make_image(np.ascontiguousarray(yuyv[:, :7]), "yuv422"), "/c")
+    depth = cv2.imencode(".png", np.full((8, 8), 1000, np.uint16))[1].tobytes()
+    with pytest.raises(UserError, match="is of depth, not of color"):
+        decode_color(make_compressed("16UC1; png compressed ", depth), "/c")
+
+
+def test_depth_may_be_in_other_units() -> None:
+    tenths = np.array([[5000, 0, 12500]], np.uint16)
+    meters = np.float32([[0.5, 0, 1.25]])
+    found = decode_depth(make_image(tenths, "16UC1"), "/d", units=10_000)
+    np.testing.assert_allclose(found, meters, rtol=1e-6)
+    np.testing.assert_array_equal(decode_depth(make_image(meters, "32FC1"), "/d", 10_000), meters)
+    png = bytes(12) + cv2.imencode(".png", tenths)[1].tobytes()
+    packed = make_compressed("16UC1; compressedDepth", png)
+    np.testing.assert_allclose(decode_depth(packed, "/d", 10_000), meters, rtol=1e-6)
+
+
+def test_images_without_times_are_paired_by_the_time_of_recording(tmp_path: Path) -> None:
+    """By their headers any color and any depth would be of one moment."""
+    K = np.array([[100.0, 0, 2], [0, 100, 2], [0, 0, 1]])
+    messages = [("/info", CAMERA_INFO, 0, make_info(K))]
+    for number in range(8):
+        color = make_image(np.full((4, 4, 3), number, np.uint8), "rgb8")
+        messages.append(("/rgb", IMAGE, 100 * number, color))
+        if number % 2 == 0:
+            depth = make_image(np.full((4, 4), 1000 + number, np.uint16), "16UC1")
+            messages.append(("/depth", IMAGE, 100 * number + 4, depth))
+    with BagReader(write_bag(tmp_path / "in", messages), TOPICS, 0.01) as reader:
+        pairs = [
+            (int(one.rgb[0, 0, 0]), round(1000 * float(one.depth[0, 0])) - 1000)
+            for one in reader.frames()
+        ]
+        assert pairs == [(0, 0), (2, 2), (4, 4), (6, 6)]
+        (told,) = reader.warnings
+        assert told.startswith("headers of /rgb have no time")
+
+
+def test_depth_of_another_frame_is_told(tmp_path: Path) -> None:
+    rgb, depth, K = read_scene()
+    aligned, far = make_image(depth, "16UC1"), make_image(depth, "16UC1")
+    far.header.frame_id = "camera_depth_optical"
+    color = make_image(rgb, "rgb8")
+    messages = [("/info", CAMERA_INFO, 0, make_info(K)), ("/rgb", IMAGE, 1, color)]
+    warnings = []
+    for name, image in (("a", aligned), ("b", far)):
+        bag = write_bag(tmp_path / name, [*messages, ("/depth", IMAGE, 2, image)])
+        with BagReader(bag, TOPICS, 0.01) as reader:
+            assert len([*reader.frames()]) == 1
+            warnings.append(reader.warnings)
+    told = "depth=/depth is of the frame camera_depth_optical, the color of camera_optical: is it"
+    assert warnings == [[], [f"{told} aligned to the color?"]]
+
+
+def test_a_wrong_unit_of_depth_is_told_and_no_probability_is_written(tmp_path: Path, capfd) -> None:
+    bag, out = write_scene(tmp_path / "in", depth_share=1.4), tmp_path / "found.mcap"
+    typed = [f"checkpoint={NAME}", *TYPED, "threads=1"]
+    assert run_command("convert_bag", HOME, [str(bag), str(out), *typed]) == 0
+    assert capfd.readouterr().out.count("times as large as its mesh") == 1  # once is enough
+    scores = list_scores(out)
+    assert len(scores) == 2
+    assert all(map(math.isnan, scores))
+    right = tmp_path / "right.mcap"
+    assert run_command("convert_bag", HOME, [str(bag), str(right), *typed, "depth_scale=1400"]) == 0
+    assert "times as large" not in capfd.readouterr().out
+    assert [score > 0.8 for score in list_scores(right)] == [True, True]
+
+
+def list_scores(bag: Path) -> list[float]:
+    """Return the score of each detection of a bag."""
+    found = [open_types().deserialize_cdr(raw, DETECTIONS) for _, _, raw in read_bag(bag)]
+    return [one.results[0].hypothesis.score for each in found for one in each.detections]
+
+
+def test_a_damaged_image_ends_nothing_that_was_found_before_it(tmp_path: Path, capfd) -> None:
+    rgb, depth, K = read_scene()
+    messages = [("/info", CAMERA_INFO, 0, make_info(K))]
+    for time in (100, 200, 300):
+        color = make_image(rgb, "rgb8", time)
+        color = dataclasses.replace(color, step=3) if time == 200 else color
+        messages += [("/rgb", IMAGE, time, color)]
+        messages += [("/depth", IMAGE, time, make_image(depth, "16UC1", time))]
+    bag = write_bag(tmp_path / "in", messages)
+    typed = [f"checkpoint={NAME}", *TYPED, *FEW]
+    assert run_command("convert_bag", HOME, [str(bag), str(tmp_path / "out.mcap"), *typed]) == 2
+    error = capfd.readouterr().err
+    assert "image of 0.200 s: color=/rgb: an image of" in error
+    assert "on_error=skip leaves such images out; the 1 images before it are in" in error
+    assert [time for _, time, _ in read_bag(tmp_path / "out.mcap")] == [100_000_000]
+    typed = [str(bag), str(tmp_path / "all.mcap"), *typed, "on_error=skip"]
+    assert run_command("convert_bag", HOME, typed) == 0
+    assert "warning: 1 messages were left out; the first: bag=" in capfd.readouterr().out
+    assert [time for _, time, _ in read_bag(tmp_path / "all.mcap")] == [100_000_000, 300_000_000]
+
+
+def test_a_camera_without_distortion_is_rectified_by_any_model() -> None:
+    rgb, depth, K = read_scene()
+    info = dataclasses.replace(make_info(K), distortion_model="inverse_brown_conrady")
+    assert rectify(rgb, depth, info)[0] is rgb
+    wrong = dataclasses.replace(make_info(K), d=np.array([0.1, -0.2, 0.0]))
+    told = r"^camera_info=/i: distortion=\[0.1, -0.2, 0.0\]: expected 4"
+    with pytest.raises(UserError, match=told):
+        rectify(rgb, depth, wrong, "/i")

@@ -158,13 +158,13 @@ def test_an_image_that_cannot_be_used_ends_nothing(example: dict[str, Any]) -> N
     node = example["PoseNode"]()
     node.tracker.may_go.release(9)
     color, depth, camera = make_messages(7)
-    color.encoding = "yuv422"
+    color.encoding = "bayer_rggb16"
     node.answer(color, depth, camera)
     node.answer(*make_messages(8))
     node.close()
     assert node.tracker.seen == [8]
     (said,) = node.log
-    assert said.startswith("color=color: encoding yuv422 is not known")
+    assert said.startswith("color=color: encoding bayer_rggb16 is not known")
 
 
 def test_silence_is_told(example: dict[str, Any]) -> None:

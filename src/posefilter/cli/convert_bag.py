@@ -1,23 +1,25 @@
 """Find objects in the images of a ROS 2 bag, and write detections into another bag."""
 
-from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import torch
+from omegaconf import DictConfig
 
 from posefilter.cli.checkpoints import methods_of
 from posefilter.cli.components import changes
 from posefilter.cli.console import JSON, ended, say
+from posefilter.cli.doubts import find_commonest, say_doubt
 from posefilter.cli.job import Job
 from posefilter.cli.machine import settle
 from posefilter.cli.predict import read_costs
-from posefilter.errors import UserError
+from posefilter.errors import Stopped, UserError
 from posefilter.estimator import Estimator
 from posefilter.progress import bars
 from posefilter.result import Result
 from posefilter.ros.bags import BagFrame, BagReader, BagWriter, Topics
-from posefilter.ros.detections import make_detections
+from posefilter.ros.detections import list_shown, make_detections
 from posefilter.ros.messages import stamp_of
 from posefilter.tracking.tracker import Tracker
 
@@ -26,59 +28,106 @@ def convert_bag(job: Job) -> None:
     """Write a Detection3DArray for each color image that has depth.
 
     Raises:
-        UserError: The bag cannot be read, or not one of its images has depth and a camera.
+        UserError: The bag cannot be read, or not one of its images has depth and a camera; or an
+            image cannot be used, and `on_error` is not "skip": those before it are written.
     """
     cfg = job.cfg
     out = Path(str(cfg.out))
     if out.exists():
         raise UserError(f"out={out}: already exists; choose another")
     topics = Topics(str(cfg.color), str(cfg.depth), str(cfg.camera_info))
-    with BagReader(
-        Path(str(cfg.bag)), topics, float(cfg.max_time_difference), cfg.rectify
-    ) as reader:
+    limit, units = float(cfg.max_time_difference), float(cfg.depth_scale)
+    skip = cfg.on_error == "skip"
+    with BagReader(Path(str(cfg.bag)), topics, limit, cfg.rectify, units, skip) as reader:
         settle(cfg.threads, cfg.seed)
         methods = methods_of(cfg.checkpoint, changes(cfg))
         estimator = Estimator(methods, costs=read_costs(cfg))
         find = choose_finder(estimator, cfg.track, cfg.seed)
-        images, blank, found = 0, 0, Counter(dict.fromkeys(estimator.objects, 0))
+        tally = Tally(dict.fromkeys(estimator.objects, 0))
         watch = bars(shown=cfg.console != JSON, transient=True)
         with BagWriter(out, str(cfg.detections)) as writer, watch as bar:
             task = bar.add_task("images", total=reader.images)
             if cfg.copy_messages:
                 writer.add_connections(reader.reader.connections)  # first: it may be refused
-            for frame in reader.frames():
-                try:
-                    message = make_detections(find(frame), frame.header)
-                except UserError as error:
-                    when = stamp_of(frame) / 1e9
-                    raise UserError(f"bag={cfg.bag}: image of {when:.3f} s: {error}") from error
-                blank += not frame.depth.any()
-                writer.write(message, frame.time)
-                found.update(one.id for one in message.detections)
-                images += 1
-                bar.update(task, completed=images + reader.unpaired + reader.early)
-            if not images:
-                raise UserError(
-                    f"bag={cfg.bag}: no color image has depth within "
-                    f"max_time_difference={cfg.max_time_difference} s, "
-                    f"after a first camera_info"
-                )
+            try:
+                for frame in reader.frames():
+                    stamp = stamp_of(frame)
+                    try:
+                        results = find(frame)
+                    except UserError as error:
+                        reader.leave_out(stamp, error)
+                        continue
+                    tally.add(frame, results, cfg.console)
+                    writer.write(make_detections(results, frame.header), frame.time)
+                    for sentence in reader.warnings[tally.warned :]:
+                        say(cfg.console, "warning", f"warning: {sentence}")
+                    tally.warned = len(reader.warnings)
+                    done = reader.unpaired + reader.early + len(reader.skipped)
+                    bar.update(task, completed=tally.images + done)
+            except (UserError, KeyboardInterrupt, Stopped) as error:
+                kept = f"the {writer.count} images before it are in {out}"
+                if writer.count and isinstance(error, UserError):
+                    raise UserError(f"{error}; {kept}") from error
+                if writer.count:
+                    say(cfg.console, "warning", f"warning: stopped; {kept}", images=writer.count)
+                raise
+            if not tally.images:
+                raise UserError(f"bag={cfg.bag}: {reader.explain_none()}")
             if cfg.copy_messages:
                 writer.copy(reader.messages())
+    tell(tally, reader, cfg, out)
+
+
+@dataclass
+class Tally:
+    """What was found in a bag."""
+
+    found: dict[str, int]  # images by object
+    images: int = 0
+    blank: int = 0  # images in which no pixel has depth
+    warned: int = 0  # of the reader's warnings
+    doubted: set[str] = field(default_factory=set)  # objects and reasons that were warned of
+    doubts: dict[str, list[str]] = field(default_factory=dict)  # by object, where it is not shown
+
+    def add(self, frame: BagFrame, results: Sequence[Result], console: str) -> None:
+        """Count an image, and say what makes its results doubtful."""
+        self.images += 1
+        self.blank += not frame.depth.any()
+        shown = {one.object for one in list_shown(results)}
+        for one in results:
+            self.found[one.object] += one.object in shown
+            if one.object not in shown:
+                self.doubts.setdefault(one.object, []).extend(one.warnings)
+            say_doubt(one, f"image of {stamp_of(frame) / 1e9:.3f} s", self.doubted, console)
+
+
+def tell(tally: Tally, reader: BagReader, cfg: DictConfig, out: Path) -> None:
+    """Say what was found, and what is doubtful."""
     if reader.distorted:
         said = "warning: the camera has a lens distortion, and images are taken as rectified ones; "
         said += "if they are not: rectify=true"
         say(cfg.console, "distorted", said)
-    if blank:
-        say(cfg.console, "blank", f"warning: in {blank} of {images} images no pixel has depth")
+    if tally.blank:
+        said = f"warning: in {tally.blank} of {tally.images} images no pixel has depth"
+        say(cfg.console, "blank", said)
+    if reader.skipped:
+        said = f"warning: {len(reader.skipped)} messages were left out; the first: "
+        say(cfg.console, "skipped", said + reader.skipped[0], skipped=len(reader.skipped))
+    for name, count in tally.found.items():
+        most = find_commonest(tally.doubts.get(name, []))
+        if not count and most:
+            reason, number = most
+            said = f"warning: {name} is in no image; in {number} of {tally.images} {reason}"
+            say(cfg.console, "warning", said, object=name, images=number, reason=reason)
     if cfg.console != JSON:
         early = f", {reader.early} before the first camera_info" if reader.early else ""
-        print(f"{images} images, {reader.unpaired} without depth{early}")
-        for name, count in found.items():
+        print(f"{tally.images} images, {reader.unpaired} without depth{early}")
+        for name, count in tally.found.items():
             print(f"{name}: in {count}")
     ended(
         cfg.console, "converted", {"bag": out}, [],
-        images=images, unpaired=reader.unpaired, early=reader.early, blank=blank, found=dict(found),
+        images=tally.images, unpaired=reader.unpaired, early=reader.early, blank=tally.blank,
+        skipped=len(reader.skipped), found=tally.found,
     )  # fmt: skip
 
 

@@ -21,7 +21,7 @@ _NEEDED = {
     "predict": ("depth_scale", "seed", "out", "cost_false_alarm", "cost_miss", "cost_unsure"),
     "convert_bag": (
         *("color", "depth", "camera_info", "detections", "track", "seed"),
-        *("max_time_difference", "copy_messages"),
+        *("max_time_difference", "copy_messages", "depth_scale"),
         *("cost_false_alarm", "cost_miss", "cost_unsure"),
     ),
     "calibrate": ("frames", "seed", "overwrite"),

@@ -100,17 +100,22 @@ def _check_bag(cfg: DictConfig) -> None:
             raise UserError(f"{key}: is missing; type convert_bag in.mcap out.mcap checkpoint=...")
     if not Path(str(cfg.bag)).exists():
         raise UserError(f"bag={cfg.bag}: no such file")
+    _check_on_error(cfg.on_error)
     _find_all(cfg.checkpoint)
     if find_spec("rosbags") is None:
         raise missing_package(f"bag={cfg.bag}", "rosbags", "bags")
+
+
+def _check_on_error(typed: Any) -> None:
+    if typed not in ("raise", "skip"):
+        raise UserError(f"on_error={typed}: choose raise or skip")
 
 
 def _check_video(cfg: DictConfig) -> None:
     """Raise UserError where there is no video to be tracked, or none that can be written."""
     if cfg.save_video not in _VIDEOS:
         raise UserError(f"save_video={cfg.save_video}: choose {', '.join(_VIDEOS)}")
-    if cfg.on_error not in ("raise", "skip"):
-        raise UserError(f"on_error={cfg.on_error}: choose raise or skip")
+    _check_on_error(cfg.on_error)
     _find_all(cfg.checkpoint)
     data = cfg.get("data")
     if bool(cfg.frames) == bool(data):

@@ -1,7 +1,6 @@
 """Follow objects through videos: poses, figures, and an annotated video."""
 
 import math
-import re
 from collections.abc import Iterator, Sequence
 from contextlib import closing
 from pathlib import Path
@@ -14,6 +13,7 @@ from omegaconf import DictConfig, OmegaConf
 from posefilter.cli.checkpoints import methods_of
 from posefilter.cli.components import changes
 from posefilter.cli.console import JSON, ended, finite, say, show_table
+from posefilter.cli.doubts import find_commonest, say_doubt
 from posefilter.cli.job import Job
 from posefilter.cli.machine import settle
 from posefilter.cli.plain import resolve
@@ -149,12 +149,8 @@ def follow(
             for result in results:
                 ids = (video.scene_id, frame.im_id, numbers[result.object])
                 truth = frame.truth.get(result.object)
-                doubt = result.blank or (result.object if result.wrong_size else "")
-                if doubt and doubt not in doubted:  # once is enough
-                    doubted.add(doubt)
-                    told = {"frame": frame.name, "object": result.object}
-                    said = f"warning: frame {frame.name}: {'; '.join(result.warnings)}"
-                    say(cfg.console, "warning", said, **told, warnings=list(result.warnings))
+                image = f"frame {frame.name}"
+                say_doubt(result, image, doubted, cfg.console, frame=frame.name)
                 rows.append(make_row(video.name, frame.name, ids, result, truth))
             log.add(rows)
             bar.advance(task)
@@ -198,12 +194,8 @@ def _say_all_lost(name: str, results: Sequence[TrackResult], cfg: DictConfig) ->
     """Say why, where an object is lost in every frame and its guesses are implausible."""
     if not results or any(one.is_tracked for one in results):
         return
-    kinds: dict[str, list[str]] = {}  # numbers differ from frame to frame
-    for warning in (warning for one in results for warning in one.warnings):
-        kinds.setdefault(re.sub(r"[\d.]+", "", warning), []).append(warning)
-    if kinds:
-        most = max(kinds.values(), key=len)
-        reason, frames = most[0], len(most)
+    if most := find_commonest([warning for one in results for warning in one.warnings]):
+        reason, frames = most
         said = f"warning: {name} is tracked in no frame; in {frames} of {len(results)} {reason}"
         say(cfg.console, "warning", said, object=name, frames=frames, reason=reason)
 

@@ -78,7 +78,7 @@ def read_distortion(numbers: Any, fisheye: bool = False) -> tuple[float, ...]:
     if len(array) not in counts or not np.isfinite(array).all():
         known = " or ".join(map(str, counts))
         raise UserError(
-            f"distortion={list(array)}: expected {known} finite coefficients, "
+            f"distortion={array.tolist()}: expected {known} finite coefficients, "
             f"{'k1 to k4' if fisheye else 'k1,k2,p1,p2[,k3[,k4,k5,k6...]]'}"
         )
     return tuple(array.tolist())

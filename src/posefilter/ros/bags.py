@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from posefilter.errors import UserError, find_reason
+from posefilter.errors import Stopped, UserError, find_reason
 from posefilter.locks import hold, release
 from posefilter.ros.messages import (
     CAMERA_INFO,
@@ -26,6 +26,7 @@ from posefilter.ros.messages import (
 )
 
 _NAME = re.compile(r"(/[A-Za-z_][A-Za-z0-9_]*)+")  # of a topic, with its namespace
+_MCAP, _ROS1 = b"\x89MCAP0\r\n", b"#ROSBAG V"  # that files begin with; the former ends with it, too
 _WAITING = 30  # messages of a topic that wait for one of another
 
 
@@ -55,26 +56,39 @@ class BagReader:
         topics: Where its images are.
         tolerance: Largest difference between the times of color and depth [s].
         rectify: Whether to undo the lens distortion that the camera tells.
+        units: Units of depth that is of whole numbers, a meter.
+        skip: Leave out messages that are damaged, and count them.
 
     Raises:
         UserError: It cannot be read, or has no such topics.
     """
 
-    def __init__(self, path: Path, topics: Topics, tolerance: float, rectify: bool = False) -> None:
+    def __init__(
+        self,
+        path: Path,
+        topics: Topics,
+        tolerance: float,
+        rectify: bool = False,
+        units: float = 1000.0,
+        skip: bool = False,
+    ) -> None:
         from rosbags.rosbag2 import Reader
 
         self.path, self.topics, self.tolerance = path, topics, int(tolerance * 1e9)
-        self.rectify = rectify
+        self.rectify, self.units, self.skip = rectify, units, skip
         self.distorted = False  # whether a camera had a lens distortion that is not undone
         self.unpaired = 0  # color images without depth
         self.early = 0  # color images before the camera is known
+        self.skipped = list[str]()  # why messages were left out
+        self.warnings = list[str]()  # what is doubtful of the images; each is listed once
+        self._nearest: int | None = None  # [ns] between color and depth that are not of one moment
+        self._by_recording = False  # whether headers have no time
         try:
             self.reader = Reader(path)
             self.reader.open()
         except Exception as error:  # a damaged header decides what breaks, memory included
-            raise UserError(
-                f"bag={path}: cannot be read as a ROS 2 bag ({find_reason(error)[:200]})"
-            ) from error
+            reason = _find_remedy(path) or find_reason(error)[:200]
+            raise UserError(f"bag={path}: cannot be read as a ROS 2 bag ({reason})") from error
         try:
             self._check_topics()
         except UserError:
@@ -132,6 +146,8 @@ class BagReader:
             if connection.topic not in self.topics:
                 continue
             message = self._read(connection, raw)
+            if message is None:
+                continue
             if connection.topic == self.topics.camera_info:
                 if camera is None:
                     self._drop_early(colors, depths)
@@ -140,7 +156,9 @@ class BagReader:
                 continue
             own = colors if connection.topic == self.topics.color else depths
             self.unpaired += own is colors and len(own) == _WAITING
-            own.append((stamp_of(message), time, message))
+            own.append((time if self._by_recording else stamp_of(message), time, message))
+            if len(own) > 1 and own[-1][0] == own[-2][0] == 0:
+                self._go_by_recording(colors, depths, connection.topic)
             if camera is not None:
                 yield from self._pair(colors, depths, camera)
         if camera is not None:
@@ -157,7 +175,10 @@ class BagReader:
         """
         for color in [*colors]:
             near = min(depths, key=lambda one: abs(one[0] - color[0]), default=None)
-            if near is None or abs(near[0] - color[0]) > self.tolerance:
+            if near is None:
+                continue
+            if (apart := abs(near[0] - color[0])) > self.tolerance:
+                self._nearest = apart if self._nearest is None else min(self._nearest, apart)
                 continue
             own = min(colors, key=lambda one: abs(one[0] - near[0]))
             later = max(color[0], near[0])
@@ -166,7 +187,67 @@ class BagReader:
                 continue
             colors.remove(color)
             depths.remove(near)
-            yield self._make(color, near, camera)
+            try:
+                frame = self._make(color, near, camera)
+            except UserError as error:
+                self.leave_out(color[0], error)
+            else:
+                yield frame
+
+    def leave_out(self, stamp: int, error: UserError) -> None:
+        """Count an image that cannot be used.
+
+        Args:
+            stamp: Its time [ns].
+            error: What is wrong with it.
+
+        Raises:
+            UserError: Damaged messages are not skipped; it names the bag and the time.
+        """
+        reason = f"bag={self.path}: image of {stamp / 1e9:.3f} s: {error}"
+        if not self.skip:
+            raise UserError(f"{reason}; on_error=skip leaves such images out") from error
+        self.skipped.append(reason)
+
+    def explain_none(self) -> str:
+        """Return why not one image could be used."""
+        if self.skipped:
+            return f"no image could be used; the first: {self.skipped[0]}"
+        counts = dict.fromkeys(self.topics, 0)
+        for one in self.reader.connections:
+            if one.topic in counts:
+                counts[one.topic] += one.msgcount
+        named = zip(Topics._fields, self.topics, strict=True)
+        empty = [f"{key}={topic}" for key, topic in named if not counts[topic]]
+        if empty:
+            return f"has no messages of {', '.join(empty)}"
+        limit = f"max_time_difference={self.tolerance / 1e9:g} s"
+        if self.early:
+            return f"camera_info={self.topics.camera_info}: its first message is after all images"
+        if self._nearest is not None:
+            return (
+                f"no color image has depth within {limit}; the nearest is "
+                f"{self._nearest / 1e9:.4g} s away"
+            )
+        return f"no color image has depth within {limit}, after a first camera_info"
+
+    def _warn(self, sentence: str) -> None:
+        if sentence not in self.warnings:
+            self.warnings.append(sentence)
+
+    def _go_by_recording(self, colors: deque[Any], depths: deque[Any], topic: str) -> None:
+        """Take the times of recording from now on, of messages that wait as well: without times in
+        their headers, any color and depth would be of one moment.
+        """
+        self._by_recording = True
+        for own in (colors, depths):
+            kept = [(time, time, message) for _, time, message in own]
+            own.clear()
+            own.extend(kept)
+        self._warn(
+            f"headers of {topic} have no time: images are paired by the time of recording, and "
+            "detections have no time either"
+        )
 
     def _drop_early(self, colors: deque[Any], depths: deque[Any]) -> None:
         """Drop the pairs that came before the camera was known, and count them."""
@@ -178,30 +259,69 @@ class BagReader:
                 self.early += 1
 
     def _read(self, connection: Any, raw: bytes) -> Any:
+        """Return a message; None where it is damaged and left out."""
         try:
             return open_types().deserialize_cdr(raw, connection.msgtype)
         except Exception as error:  # of struct, numpy and assertions
-            raise UserError(
+            reason = (
                 f"bag={self.path}: a message of {connection.topic} is damaged "
                 f"({find_reason(error)[:200]})"
-            ) from error
+            )
+            if not self.skip:
+                raise UserError(f"{reason}; on_error=skip leaves such messages out") from error
+            self.skipped.append(reason)
+            return None
 
     def _make(self, color: tuple[int, int, Any], depth: tuple[int, int, Any], camera: Any) -> Any:
         rgb = decode_color(color[2], self.topics.color)
-        z = decode_depth(depth[2], self.topics.depth)
+        z = decode_depth(depth[2], self.topics.depth, self.units)
         if rgb.shape[:2] != z.shape:
             raise UserError(
                 f"depth={self.topics.depth}: {z.shape[1]}x{z.shape[0]} pixels, but the color image "
                 f"has {rgb.shape[1]}x{rgb.shape[0]}; name a topic of depth aligned to color"
             )
+        self._compare_frames(color[2], depth[2], camera)
         K = decode_intrinsics(camera, z.shape, self.topics.camera_info)
         if self.rectify:
             rgb, z = rectify(rgb, z, camera, self.topics.camera_info)
         return BagFrame(rgb, z, K, color[2].header, color[1])
 
+    def _compare_frames(self, color: Any, depth: Any, camera: Any) -> None:
+        """Warn of depth or a camera that is of another place than the color: depth that is not
+        aligned may have the color's size.
+        """
+        own = str(color.header.frame_id)
+        for key, message in (("depth", depth), ("camera_info", camera)):
+            other = str(message.header.frame_id)
+            if own and other and own != other:
+                advice = "is it aligned to the color?" if key == "depth" else "is it the color's?"
+                topic = getattr(self.topics, key)
+                self._warn(f"{key}={topic} is of the frame {other}, the color of {own}: {advice}")
+
+
+def _find_remedy(path: Path) -> str:
+    """Return why a bag cannot be opened and what helps, "" where that is not known."""
+    stored = sorted(one.name for ending in ("mcap", "db3") for one in path.glob(f"*.{ending}"))
+    if path.is_dir() and stored and not (path / "metadata.yaml").exists():
+        return (
+            "it has no metadata.yaml, as after a recorder that was killed: name the file in it, "
+            f"{path / stored[0]}, or run `ros2 bag reindex`"
+        )
+    if path.is_file():
+        with path.open("rb") as file:
+            head = file.read(len(_ROS1))
+            file.seek(max(0, path.stat().st_size - len(_MCAP)))
+            tail = file.read()
+        if head == _ROS1:
+            return "it is of ROS 1; rosbags-convert makes a ROS 2 bag of it"
+        if head.startswith(_MCAP) and tail != _MCAP:
+            return "it was cut off; `mcap recover` saves what is there"
+    return ""
+
 
 class BagWriter:
-    """A new bag; it comes to be when it is closed without an error, whole.
+    """A new bag. It comes to be when it is closed: whole, or with the images until an interruption
+    or an error of the user's, if there are any.
 
     Args:
         path: The .mcap file to write, or without that ending a bag's folder.
@@ -227,6 +347,7 @@ class BagWriter:
         # version 9, of Jazzy, has metadata that Humble cannot read; all read 8
         self.writer = Writer(self.parts / name, version=8, storage_plugin=StoragePlugin.MCAP)
         self.copies: dict[int, Any] = {}
+        self.count = 0  # messages with detections
 
     def __enter__(self) -> "BagWriter":
         """Open the bag."""
@@ -235,10 +356,13 @@ class BagWriter:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
-        """Close the bag, and put it into its place; after an error nothing is left."""
+        """Close the bag, and put it into its place; after an error of the program's, or before the
+        first image, nothing is left.
+        """
         try:
             self.writer.close()
-            if kind is None:
+            kept = kind is not None and issubclass(kind, (UserError, KeyboardInterrupt, Stopped))
+            if kind is None or (kept and self.count):
                 whole = self.writer.path
                 if self.path.suffix == ".mcap":
                     (whole,) = whole.glob("*.mcap")
@@ -250,6 +374,7 @@ class BagWriter:
     def write(self, message: Any, time: int) -> None:
         """Write a Detection3DArray at a time [ns]."""
         self.writer.write(self.detections, time, open_types().serialize_cdr(message, DETECTIONS))
+        self.count += 1
 
     def add_connections(self, connections: Sequence[Any]) -> None:
         """Add the topics of another bag, whose messages `copy` is to write.

@@ -40,6 +40,14 @@ def list_shown(results: Sequence[Result]) -> list[Result]:
     return [one for one in results if getattr(one, "is_tracked", one.verdict != "absent")]
 
 
+def choose_score(result: Result) -> float:
+    """Return the calibrated probability of a detection; NaN where there is none, or where it does
+    not hold, since depth or intrinsics must be wrong: a detection carries no verdict.
+    """
+    doubted = result.wrong_size or bool(result.blank)
+    return math.nan if result.probability is None or doubted else float(result.probability)
+
+
 def make_quaternion(pose: np.ndarray) -> list[float]:
     """Return the rotation of a pose (4, 4) as a quaternion [x, y, z, w]."""
     R = torch.from_numpy(pose[:3, :3].astype(np.float64))
@@ -63,8 +71,8 @@ def make_detections(results: Sequence[Result], header: Any) -> Any:
     """Return a Detection3DArray with a detection for each object but those that are absent, or
     whose track is lost.
 
-    A detection's hypothesis has the calibrated probability as its score, NaN where there is none,
-    and the pose of the object's frame, that of its mesh file. Its box is the object's own.
+    A detection's hypothesis has the score of `choose_score`, and the pose of the object's frame,
+    that of its mesh file. Its box is the object's own.
 
     Args:
         results: Of one image, an object each.
@@ -80,9 +88,8 @@ def _make_detection(result: Result, header: Any) -> Any:
     own = belief.covariance_about(result.pose)
     covariance = to_ros_covariance(own, result.pose, belief.center)
     center, (x, y, z) = measure_box(result)
-    score = math.nan if result.probability is None else result.probability
     hypothesis = make_message(
-        "vision_msgs/msg/ObjectHypothesis", class_id=result.object, score=score
+        "vision_msgs/msg/ObjectHypothesis", class_id=result.object, score=choose_score(result)
     )
     pose = make_message(
         "geometry_msgs/msg/PoseWithCovariance",

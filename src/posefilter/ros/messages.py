@@ -13,7 +13,7 @@ import numpy as np
 
 from posefilter.data.readers.decode import decode_image
 from posefilter.errors import UserError
-from posefilter.geometry.lens import undistort
+from posefilter.geometry.lens import read_distortion, undistort
 from posefilter.limits import MOST_SIDE
 
 IMAGE, COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
@@ -34,19 +34,30 @@ _VISION = {
     "Detection3DArray": "std_msgs/Header header\nvision_msgs/Detection3D[] detections",
 }
 _MODELS = ("plumb_bob", "rational_polynomial", "equidistant")  # of distortion
-_CHANNELS = {"rgb8": 3, "bgr8": 3, "rgba8": 4, "bgra8": 4, "mono8": 1, "8UC3": 3}
+# ROS names a mosaic by its first two rows, OpenCV by the middle of the second and third
+_BAYER = {
+    "bayer_rggb8": cv2.COLOR_BayerBG2RGB,
+    "bayer_bggr8": cv2.COLOR_BayerRG2RGB,
+    "bayer_gbrg8": cv2.COLOR_BayerGR2RGB,
+    "bayer_grbg8": cv2.COLOR_BayerGB2RGB,
+}
 _TO_RGB = {
     "bgr8": cv2.COLOR_BGR2RGB,
     "8UC3": cv2.COLOR_BGR2RGB,
     "rgba8": cv2.COLOR_RGBA2RGB,
     "bgra8": cv2.COLOR_BGRA2RGB,
     "mono8": cv2.COLOR_GRAY2RGB,
+    "yuv422": cv2.COLOR_YUV2RGB_UYVY,
+    "yuv422_yuy2": cv2.COLOR_YUV2RGB_YUY2,
+    **_BAYER,
 }
+_CHANNELS = {
+    "rgb8": 3, "bgr8": 3, "rgba8": 4, "bgra8": 4, "mono8": 1, "8UC3": 3, "yuv422": 2,
+    "yuv422_yuy2": 2, **dict.fromkeys(_BAYER, 1),
+}  # fmt: skip
 _SATURATED = 65535  # what cameras write into 16 bits beyond their range
 _PNG = b"\x89PNG\r\n\x1a\n"
-_DEPTHS: dict[str, tuple[str, float]] = {
-    "16UC1": ("u2", 1e-3), "mono16": ("u2", 1e-3), "32FC1": ("f4", 1.0)
-}  # fmt: skip
+_DEPTHS = {"16UC1": "u2", "mono16": "u2", "32FC1": "f4"}
 
 
 @cache
@@ -72,26 +83,46 @@ def decode_color(message: Any, topic: str) -> np.ndarray:
         UserError: It is damaged, or of an encoding that is not known.
     """
     if hasattr(message, "format"):
-        picture = decode_image(bytes(message.data), Path(f"color={topic}"), cv2.IMREAD_COLOR)
-        return np.ascontiguousarray(picture[..., ::-1])
+        return _decode_compressed_color(message, topic)
     encoding = str(message.encoding)
     if encoding not in _CHANNELS:
         known = ", ".join(_CHANNELS)
         raise UserError(f"color={topic}: encoding {encoding} is not known; there are {known}")
     rows = _read_rows(message, topic, "color", np.dtype("u1"), _CHANNELS[encoding])
-    if encoding in _TO_RGB:
-        return np.asarray(cv2.cvtColor(np.ascontiguousarray(rows), _TO_RGB[encoding]))
-    return np.ascontiguousarray(rows)
+    if encoding not in _TO_RGB:
+        return np.ascontiguousarray(rows)
+    if rows.shape[1] % 2 and encoding.startswith("yuv422"):
+        raise UserError(f"color={topic}: {encoding} of an odd width, {rows.shape[1]}")
+    return np.asarray(cv2.cvtColor(np.ascontiguousarray(rows), _TO_RGB[encoding]))
 
 
-def decode_depth(message: Any, topic: str) -> np.ndarray:
+def _decode_compressed_color(message: Any, topic: str) -> np.ndarray:
+    """Return color (H, W, 3) RGB of the transport `compressed`, whose format is such as `rgb8; jpeg
+    compressed bgr8`: what it was, and what was packed; or the name of the packing alone.
+    """
+    own, _, packed = str(message.format).partition(";")
+    own = own.strip()
+    if packed and own in _DEPTHS and own != "mono16":
+        raise UserError(f"color={topic}: format '{message.format}' is of depth, not of color")
+    data, path = bytes(message.data), Path(f"color={topic}")
+    if own in _BAYER and packed.split()[-1:] == ["compressed"]:  # the mosaic itself
+        return np.asarray(cv2.cvtColor(decode_image(data, path, cv2.IMREAD_GRAYSCALE), _BAYER[own]))
+    return np.ascontiguousarray(decode_image(data, path, cv2.IMREAD_COLOR)[..., ::-1])
+
+
+def decode_depth(message: Any, topic: str, units: float = 1000.0) -> np.ndarray:
     """Return the depth of an Image or a CompressedImage.  -> (H, W) float32 [m], 0 where unknown.
+
+    Args:
+        message: The message.
+        topic: Told in errors.
+        units: Units of whole numbers a meter; ROS has millimeters.
 
     Raises:
         UserError: It is damaged, or of an encoding that is not known.
     """
     if hasattr(message, "format"):
-        depth = _decode_compressed_depth(message, topic)
+        depth = _decode_compressed_depth(message, topic, units)
     else:
         encoding = str(message.encoding)
         if encoding not in _DEPTHS:
@@ -99,10 +130,10 @@ def decode_depth(message: Any, topic: str) -> np.ndarray:
                 f"depth={topic}: encoding {encoding} is not known; there are 16UC1 (millimeters) "
                 f"and 32FC1 (meters)"
             )
-        kind, scale = _DEPTHS[encoding]
         order = ">" if message.is_bigendian else "<"
-        rows = _read_rows(message, topic, "depth", np.dtype(order + kind), 1)[..., 0]
-        depth = _drop_saturated(rows).astype(np.float32) * np.float32(scale)
+        rows = _read_rows(message, topic, "depth", np.dtype(order + _DEPTHS[encoding]), 1)[..., 0]
+        depth = _drop_saturated(rows).astype(np.float32)
+        depth = depth if encoding == "32FC1" else depth * np.float32(1 / units)
     return np.where(np.isfinite(depth) & (depth > 0), depth, 0).astype(np.float32)
 
 
@@ -110,7 +141,7 @@ def _drop_saturated(rows: np.ndarray) -> np.ndarray:
     return rows if rows.dtype.kind == "f" else np.where(rows == _SATURATED, 0, rows)
 
 
-def _decode_compressed_depth(message: Any, topic: str) -> np.ndarray:
+def _decode_compressed_depth(message: Any, topic: str, units: float) -> np.ndarray:
     """Return depth (H, W) [m] of the transports `compressedDepth` and `compressed`, both as PNG.
 
     `compressedDepth` puts 12 bytes before the PNG: a number of the format, and a and b by which it
@@ -130,7 +161,7 @@ def _decode_compressed_depth(message: Any, topic: str) -> np.ndarray:
         )
     kept = _drop_saturated(picture).astype(np.float32)
     if encoding != "32FC1":
-        return kept * np.float32(_DEPTHS[encoding][1])
+        return kept * np.float32(1 / units)
     _, a, b = struct.unpack_from("<iff", data)
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.where(kept > 0, np.float32(a) / (kept - np.float32(b)), 0)
@@ -224,13 +255,19 @@ def rectify(
             f"camera_info={topic}: turns rectified images (R), as of a stereo pair, which is not "
             "supported; have stereo_image_proc rectify them"
         )
+    if not is_distorted(message):
+        same = np.allclose(K, wanted)
+        return (rgb, depth) if same else undistort(rgb, depth, K, np.zeros(4), False, wanted)
     model = str(message.distortion_model)
     if model and model not in _MODELS:
-        raise UserError(f"camera_info={topic}: distortion_model={model} is not one of {_MODELS}")
-    if not is_distorted(message) and np.allclose(K, wanted):
-        return rgb, depth
-    numbers = np.asarray(message.d, dtype=np.float64) if len(message.d) else np.zeros(4)
-    return undistort(rgb, depth, K, numbers, model == "equidistant", wanted)
+        known = ", ".join(_MODELS)
+        raise UserError(f"camera_info={topic}: distortion_model={model} is not one of {known}")
+    fisheye = model == "equidistant"
+    try:
+        numbers = read_distortion(message.d, fisheye)
+    except UserError as error:
+        raise UserError(f"camera_info={topic}: {error}") from error
+    return undistort(rgb, depth, K, numbers, fisheye, wanted)
 
 
 def is_distorted(message: Any) -> bool:
