@@ -56,8 +56,8 @@ def check_images(rgb: Any, depth: Any, intrinsics: Any, empty: bool = False) -> 
     z, K = as_array(depth, "depth"), as_array(intrinsics, "intrinsics")
     batched = color.ndim == 4
     color, z = (value if batched else value[None] for value in (color, z))
-    if z.ndim == 4 and z.shape[1] == 1:  # (B, 1, H, W), as torch has it
-        z = z[:, 0]
+    if z.ndim == 4 and 1 in (z.shape[1], z.shape[3]):  # (B, 1, H, W), as torch has it, or last
+        z = z[:, 0] if z.shape[1] == 1 else z[..., 0]
     if z.shape != color.shape[:3]:
         raise UserError(
             f"depth: has shape {z.shape[1 - batched :]}, but rgb {color.shape[1 - batched : 3]}"
@@ -151,6 +151,7 @@ def _as_channels_last(rgb: Any) -> np.ndarray:
     if color.ndim not in (3, 4) or 3 not in (color.shape[-1], color.shape[-3]):
         raise UserError(
             f"rgb: has shape {color.shape}; expected (H, W, 3), or a batch (B, H, W, 3)"
+            + (": leave the alpha out, rgb[..., :3]" if color.shape[-1:] == (4,) else "")
         )
     return color if color.shape[-1] == 3 else np.moveaxis(color, -3, -1)
 
@@ -163,6 +164,8 @@ def as_array(value: Any, name: str) -> np.ndarray:
     """
     if value is None or isinstance(value, str | Path):
         raise UserError(f"{name}: is {value!r}; must be an array or tensor, not a file name")
+    if isinstance(value, np.ma.MaskedArray):
+        return np.asarray(value.filled(0))  # masked depth is unknown
     if isinstance(value, torch.Tensor):
         plain = value.detach().cpu()
         return np.asarray((plain.float() if plain.dtype == torch.bfloat16 else plain).numpy())

@@ -16,6 +16,15 @@ from posefilter.errors import BadData, find_reason
 MOST_SIDE, MOST_PIXELS = 16_384, 1 << 27  # of an image: a photograph of 100 megapixels passes
 FEWEST_KNOWN = 0.001  # share of an image's pixels with depth, below which it cannot be judged
 MOST_BYTES = 1 << 29  # of an image's or JSON's file
+_OTHERS = {  # by what files begin with, that are named for images
+    b"\x93NUMPY": "it is an array: end its name in .npy",
+    b"PK\x03\x04": "it is an archive, as .npz is: save the array by np.save",
+    b"version https://git-lfs": "it is a pointer of Git LFS: run git lfs pull",
+    b"<": "it is a page of the web or XML",
+    b"v/1\x01": "it is an EXR: save it as .npy, or as TIFF of 32-bit floats",
+    b"II*\0": "a TIFF of this kind, such as of 64-bit floats, is not read: save 32-bit floats",
+    b"MM\0*": "a TIFF of this kind, such as of 64-bit floats, is not read: save 32-bit floats",
+}
 
 
 def read_bytes(path: Path, max_bytes: int = MOST_BYTES) -> bytes:
@@ -29,6 +38,8 @@ def read_bytes(path: Path, max_bytes: int = MOST_BYTES) -> bytes:
         BadData: The file is missing, larger, or may not be read.
     """
     try:
+        if path.is_dir():
+            raise BadData(path, "is a folder, not a file")
         if not path.is_file():
             raise BadData(path, "missing file")
         size = path.stat().st_size
@@ -117,6 +128,9 @@ def check_picture(path: Path, data: bytes) -> int:
     except Image.DecompressionBombError as error:
         raise BadData(path, "image too large", str(error)) from error
     except (UnidentifiedImageError, OSError, SyntaxError, ValueError, struct.error) as error:
+        known = next((what for head, what in _OTHERS.items() if data.startswith(head)), None)
+        if known is not None:
+            raise BadData(path, "is no image that can be read", known) from error
         raise BadData(path, "truncated or corrupt image", "its header cannot be read") from error
     if max(width, height) > MOST_SIDE or width * height > MOST_PIXELS:
         raise BadData(

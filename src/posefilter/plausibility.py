@@ -9,6 +9,7 @@ _LARGEST = 3.0  # times the image's longer side
 _FEWEST = 0.05  # of the pixels have depth
 _NEAREST = 0.2  # [m] the median depth; few depth cameras measure nearer
 _FARTHEST = 6.0  # [m] likewise; beyond, most measure little, and objects for a hand are some pixels
+_NEAR = 0.06  # of the image's size, likewise: nearer ones are those of the whole image
 _OFF = 0.24  # of the image's size: principal points farther from its middle are those of a part
 
 
@@ -51,7 +52,13 @@ def find_warnings(
             "depth in the right units (depth_scale)?"
         )
     off = np.abs(intrinsics[:2, 2] / (width, height) - 0.5)
-    if off.max() > _OFF:
+    from_swapped = np.abs(intrinsics[:2, 2] - 0.5 * np.array([height, width])) / (width, height)
+    if from_swapped.max() < _NEAR < off.min():
+        found.append(
+            "the intrinsics' principal point is the middle of the image with its sides swapped: "
+            "are cx and cy swapped, or is the image turned?"
+        )
+    elif off.max() > _OFF:
         found.append(
             f"the intrinsics' principal point is far from the middle of the image ({off.max():.0%} "
             "of its size): that is right for a part of an image alone"

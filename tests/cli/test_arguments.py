@@ -330,3 +330,24 @@ def test_a_run_goes_on_that_was_begun_with_a_setting_that_nothing_reads(
         file.write_text("[+note=first, trainer.max_steps=0]")
     assert run_command("train", HOME, [f"resume={tmp_path}"]) == MISTAKE
     assert "trainer.max_steps" in capsys.readouterr().err  # and not of the note
+
+
+@pytest.mark.parametrize("name", ["1.10", "2024_05_02", "1e5", "007", "1.", ".5"])
+@pytest.mark.parametrize("key", ["out", "data.root", "+frames", "generate.meshes"])
+def test_a_folder_that_is_named_by_a_number_is_taken_as_it_is_typed(key: str, name: str) -> None:
+    """As a number 1.10 would be 1.1: another folder, whose results would be replaced."""
+    (parsed,) = OverridesParser.create().parse_overrides(quoted([f"{key}={name}"]))
+    assert parsed.value() == name
+
+
+def test_numbers_of_other_settings_stay_numbers() -> None:
+    typed = ["seed=3", "optimizer.lr=1e-3", "out=null", "checkpoint=a.ckpt", "seed=1,2"]
+    assert quoted(typed) == typed
+
+
+@pytest.mark.parametrize("typed", ["intrinsics=(1,2,3,4)", "intrinsics=1,2,3,4,"])
+def test_advice_for_lists_of_numbers_is_their_form(
+    typed: str, capfd: pytest.CaptureFixture[str]
+) -> None:
+    assert run_command("predict", HOME, ["rgb=a.png", "depth=b.png", typed]) == 2
+    assert "it is typed intrinsics=fx,fy,cx,cy" in capfd.readouterr().err

@@ -1,8 +1,12 @@
 """Depth that no camera measures is unknown, or in another unit."""
 
+from pathlib import Path
+
+import cv2
 import numpy as np
 import pytest
 
+from posefilter.cli.predict import read_photograph
 from posefilter.errors import UserError
 from posefilter.images import check_images, drop_unknown
 
@@ -25,3 +29,33 @@ def test_depth_in_millimeters_is_still_said_to_be() -> None:
     with pytest.raises(UserError, match=r"the median would be 800 m; is it in meters\?"):
         check_images(RGB, depth, K)
     assert drop_unknown(np.full((4, 4), 1e300)).max() < np.inf
+
+
+@pytest.mark.parametrize("form", ["masked", "last", "first"])
+def test_depth_may_be_masked_or_have_a_channel(form: str) -> None:
+    depth = np.full((40, 60), 0.8)
+    depth[:20] = 50.0
+    if form == "masked":
+        images, _ = check_images(RGB, np.ma.masked_greater(depth, 10), K)
+        assert np.unique(images.depth).tolist() == [0, np.float32(0.8)]
+        return
+    axis = -1 if form == "last" else 0
+    images, _ = check_images(RGB, np.expand_dims(depth, axis), K)
+    np.testing.assert_array_equal(images.depth[0], depth.astype(np.float32))
+
+
+@pytest.mark.parametrize("name", ["far.npy", "far.tiff"])
+def test_files_may_say_so_as_arrays_do(name: str, tmp_path: Path) -> None:
+    depth = np.full((40, 60), 1e10, np.float32)
+    depth[:15] = 0.8
+    path, color = tmp_path / name, tmp_path / "a.png"
+    if path.suffix == ".npy":
+        np.save(path, depth)
+    else:
+        assert cv2.imwrite(str(path), depth)
+    assert cv2.imwrite(str(color), RGB)
+    _, read = read_photograph(str(color), str(path), 1000.0)
+    assert np.unique(read).tolist() == [0, np.float32(0.8)]
+    np.save(tmp_path / "mm.npy", np.full((40, 60), 800.0))
+    with pytest.raises(UserError, match="its floats should be meters"):
+        read_photograph(str(color), str(tmp_path / "mm.npy"), 1000.0)

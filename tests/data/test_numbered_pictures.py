@@ -73,3 +73,51 @@ def test_pictures_that_are_counted_from_other_numbers_are_paired_by_order(tmp_pa
             picture = np.ones((4, 4), np.uint16 if folder == "depth" else np.uint8)
             cv2.imwrite(str(tmp_path / folder / f"{number}.png"), picture)
     assert [frame.im_id for frame in FolderVideo(tmp_path, np.eye(3), 1000.0)] == [*range(5)]
+
+
+def write_pictures(root: Path, color: list[str], depth: list[str]) -> None:
+    """Write pictures of these names."""
+    for folder, names, kind in (("rgb", color, np.uint8), ("depth", depth, np.uint16)):
+        (root / folder).mkdir()
+        for name in names:
+            cv2.imwrite(str(root / folder / name), np.ones((4, 4), kind))
+
+
+def test_pictures_that_are_counted_alike_are_paired_wherever_counts_begin(tmp_path: Path) -> None:
+    write_pictures(tmp_path, ["0_color.png", "1_color.png"], ["1_depth.png", "2_depth.png"])
+    video = FolderVideo(tmp_path, np.eye(3), 1000.0)
+    assert [frame.im_id for frame in video] == [0, 1]
+
+
+def test_a_missing_number_is_told_and_not_paired_over(tmp_path: Path) -> None:
+    """As of a recorder that dropped a picture of each: the number of pictures is the same."""
+    color = [f"{number}_color.png" for number in (1, 2, 3)]
+    write_pictures(tmp_path, color, [f"{number}_depth.png" for number in (1, 3, 4)])
+    told = r"rgb/2_color\.png would be paired by order with number 3 in depth/: is number 2 missing"
+    with pytest.raises(UserError, match=told):
+        FolderVideo(tmp_path, np.eye(3), 1000.0)
+
+
+@pytest.mark.parametrize("folder", ["rgb", "depth"])
+def test_two_pictures_of_one_name_are_told(folder: str, tmp_path: Path) -> None:
+    write_pictures(tmp_path, ["1.png", "2.png"], ["1.png", "2.png"])
+    cv2.imwrite(str(tmp_path / folder / "1.tiff"), np.ones((4, 4), np.uint16))
+    with pytest.raises(UserError, match=rf"{folder}/1\.png and {folder}/1\.tiff are of one name"):
+        FolderVideo(tmp_path, np.eye(3), 1000.0)
+
+
+def test_hidden_files_are_no_pictures_and_times_need_not_be_of_one_length(tmp_path: Path) -> None:
+    names = [f"1700000000.{fraction}.png" for fraction in ("123", "25", "5")]
+    write_pictures(tmp_path, names, names)
+    (tmp_path / "rgb" / "._1700000000.123.png").write_bytes(b"of macOS")
+    video = FolderVideo(tmp_path, np.eye(3), 1000.0)
+    assert [(frame.name, frame.im_id) for frame in video] == [
+        (Path(name).stem, place) for place, name in enumerate(names)
+    ]
+
+
+def test_depth_may_be_tiff_of_floats(tmp_path: Path) -> None:
+    write_pictures(tmp_path, ["1.bmp"], [])
+    cv2.imwrite(str(tmp_path / "depth" / "1.tiff"), np.full((4, 4), 1.5, np.float32))
+    (frame,) = FolderVideo(tmp_path, np.eye(3), 1000.0)
+    np.testing.assert_array_equal(frame.depth, np.full((4, 4), 1.5, np.float32))

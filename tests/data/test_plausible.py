@@ -266,8 +266,8 @@ def test_depth_is_read_from_arrays(tmp_path):
     assert not holds_meters(tmp_path / "u.npy")
     for name, array, words in (
         ("negative", np.full((2, 2), -1.0), "negative"),
-        ("flat", np.ones(4), "one channel"),
-        ("text", np.array([["a"]]), "not numbers"),
+        ("flat", np.ones(4), r"no array \(H, W\) of numbers \(found float64 \(4,\)"),
+        ("text", np.array([["a"]]), "no array"),
         ("objects", np.array([[{}]], dtype=object), "not readable as a NumPy array"),
     ):
         np.save(tmp_path / f"{name}.npy", array)
@@ -385,6 +385,22 @@ def test_a_median_depth_beyond_what_cameras_measure_is_told():
     for median, told in ((8.0, True), (3.0, False)):
         found = find_warnings(where, model, np.full((100, 100), median), K)
         assert any(f"the median depth is {median:.2g} m, farther" in one for one in found) is told
+
+
+def test_a_principal_point_of_the_turned_image_is_told():
+    """As of cx and cy that are swapped; one of the image itself, or of a part, is not."""
+    model = object_model(MeshStore("builtin").load("carton"))
+    where = np.eye(4)
+    where[2, 3] = 0.8
+    depth = np.full((480, 640), 0.9)
+    for cx, cy, told in ((241.3, 313.0, True), (313.0, 241.3, False), (100.0, 313.0, False)):
+        K = np.array([[1066.0, 0, cx], [0, 1066.0, cy], [0, 0, 1]])
+        found = find_warnings(where, model, depth, K)
+        assert any("are cx and cy swapped" in one for one in found) is told
+    square = np.array([[600.0, 0, 200], [0, 600.0, 205], [0, 0, 1]])
+    assert not any(
+        "swapped" in one for one in find_warnings(where, model, depth[:400, :400], square)
+    )
 
 
 def test_a_score_that_is_no_number_is_refused(tmp_path):

@@ -18,6 +18,13 @@ _VALUED = (
 )
 _INFO = ("--info", "-i")
 _KINDS = ("all", "config", "defaults", "defaults-tree", "plugins", "searchpath")  # of information
+# settings that name files and folders, by their last word, and what Hydra reads as a number
+_PLACES = (
+    *("out", "rgb", "depth", "frames", "meshes", "root", "checkpoint", "run", "mesh", "estimates"),
+    *("bag", "resume", "warm_start", "distractor_meshes", "targets", "absent", "cache_dir"),
+    *("model_points_dir", "name"),
+)
+_NUMBER = re.compile(r"[+-]?[0-9_.]*[0-9][0-9_.]*([eE][+-]?[0-9_]+)?")
 _FOLDERS = ("run", "runs", "sweep", "out")  # of a report
 
 
@@ -95,13 +102,18 @@ def without_trace(arguments: list[str], name: str) -> list[str]:
 
 def quoted(arguments: Sequence[str]) -> list[str]:
     """Return settings with quotes round values that Hydra's grammar has no place for, such as a
-    folder with an umlaut in its name; each part of a list of values by itself. A list that is a
-    path that there is, as of a sweep's job, is one value.
+    folder with an umlaut in its name, and round names of files and folders that it would read as
+    numbers: 1.10 would be 1.1, and 2024_05_02 be 20240502.
+
+    Each part of a list of values is quoted by itself. A list that is a path that there is, as of a
+    sweep's job, is one value.
     """
     out = []
     for argument in arguments:
         key, _, value = argument.partition("=")
         odd = re.search(r"[^\x20-\x7e]|[=#&;!^`~]", value) is not None
+        is_place = key.lstrip("+~").rpartition(".")[2] in _PLACES
+        odd |= is_place and _NUMBER.fullmatch(value) is not None
         if odd and re.fullmatch(r"[+~]{0,2}[\w./@]+", key) and not _written(value):
             values = [value] if _exists(value) else value.split(",")
             parts = (part.replace("'", "\\'") for part in values)

@@ -24,6 +24,7 @@ from posefilter.cli.renamed import rename_argument, rename_missing
 from posefilter.errors import find_reason
 
 # choices that packages of others bring
+_FORMS = {"intrinsics": "fx,fy,cx,cy", "distortion": "k1,k2,p1,p2,k3"}  # of lists of numbers
 _EXTRA = ("optuna", "joblib", "submitit_local", "submitit_slurm")
 
 
@@ -88,6 +89,8 @@ def _tell_quotes(argument: str) -> str:
     key, found, value = argument.partition("=")
     if not found:
         return ""
+    if form := _FORMS.get(key):
+        return f"; it is typed {key}={form}"
     escaped = value.replace("'", "\\'")
     text = f"{key}='{escaped}'"
     typed = shlex.quote(text) if re.search(r'["$`\\!]', text) else f'"{text}"'

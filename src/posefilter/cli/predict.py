@@ -28,7 +28,7 @@ from posefilter.figures.overlay import Shape
 from posefilter.figures.recording import record
 from posefilter.figures.view_data import collect_view_data
 from posefilter.geometry.lens import read_distortion, undistort
-from posefilter.images import check_images
+from posefilter.images import check_images, drop_unknown
 from posefilter.meshes.ycb import number_objects
 from posefilter.metrics.bop_results import PoseRow, choose_score, write_poses_csv
 from posefilter.result import Result, collect_results
@@ -345,7 +345,7 @@ def read_photograph(rgb: str, depth: str, depth_scale: float) -> tuple[np.ndarra
 
     Raises UserError where they do not fit each other.
     """
-    color, z = read_color(Path(rgb)), read_depth(Path(depth), depth_scale)
+    color, z = read_color(Path(rgb)), drop_unknown(read_depth(Path(depth), depth_scale))
     if color.shape[:2] != z.shape:
         raise UserError(
             f"depth={depth}: {z.shape[1]}x{z.shape[0]} pixels, but the color image has "

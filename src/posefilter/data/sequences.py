@@ -18,7 +18,8 @@ from posefilter.errors import UserError
 from posefilter.geometry.lens import undistort
 
 _TIME = re.compile(r"\d+\.\d+|\d{10,}")
-_COLOR, _DEPTH = (".png", ".jpg", ".jpeg"), (".png", ".npy")
+_COLOR = (".png", ".jpg", ".jpeg", ".bmp", ".webp", ".tif", ".tiff", ".ppm")
+_DEPTH = (".png", ".npy", ".tif", ".tiff", ".pgm", ".pfm")
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,7 +66,8 @@ class Video(ABC):
 class FolderVideo(Video):
     """A folder with `rgb/` and `depth/`: pictures of the same names, or as many of each, in order.
 
-    Where the names are times, each color picture must be nearest to its own depth picture.
+    Where the names are times, each color picture must be nearest to its own depth picture; where
+    they are counted, the numbers of all pairs must be as far apart.
 
     Where the color pictures' names differ in one number alone (`000123.png`, `frame_7_rgb.png`),
     the frames are in its order, and it is their `im_id`. Otherwise they are in the order of the
@@ -97,7 +99,7 @@ class FolderVideo(Video):
         self._distortion = distortion
         self.ids: dict[str, int] = {}
         color, numbers = _list_pictures(folder, "rgb", _COLOR)
-        depth, _ = _list_pictures(folder, "depth", _DEPTH)
+        depth, others = _list_pictures(folder, "depth", _DEPTH)
         by_stem = {path.stem: path for path in depth}
         if all(path.stem in by_stem for path in color):
             depth = [by_stem[path.stem] for path in color]
@@ -112,9 +114,12 @@ class FolderVideo(Video):
                 f"frames={folder}: {len(color)} pictures in rgb/ and {len(depth)} in depth/, of "
                 f"other names; name both alike"
             )
-        else:
+        elif all(_TIME.fullmatch(path.stem) for path in (*color, *depth)):
             _check_times(folder, color, depth)
-        self._frames = [*zip(numbers, color, depth, strict=True)][::stride]
+        elif numbers is not None and others is not None:
+            _check_numbers(folder, color, numbers, others)
+        places = numbers or range(len(color))
+        self._frames = [*zip(places, color, depth, strict=True)][::stride]
 
     def __len__(self) -> int:
         """Return the number of frames."""
@@ -222,11 +227,9 @@ def number_names(names: Sequence[str]) -> list[int] | None:
 
 
 def _check_times(folder: Path, color: Sequence[Path], depth: Sequence[Path]) -> None:
-    """Raise UserError where pictures are named by times, and those that are paired by order are not
-    the nearest in time. Times have a fraction or ten digits and more; other numbers may be counts.
+    """Raise UserError where pictures that are named by times, and paired by order, are not the
+    nearest in time. Times have a fraction or ten digits and more; other numbers may be counts.
     """
-    if not all(_TIME.fullmatch(path.stem) for path in (*color, *depth)):
-        return
     own, other = (np.array([float(path.stem) for path in paths]) for paths in (color, depth))
     order = np.argsort(other)
     after = np.searchsorted(other[order], own).clip(1, max(len(other) - 1, 1))
@@ -243,16 +246,42 @@ def _check_times(folder: Path, color: Sequence[Path], depth: Sequence[Path]) -> 
         )
 
 
-def _list_pictures(folder: Path, name: str, endings: Sequence[str]) -> tuple[list[Path], list[int]]:
-    """Return the pictures of a folder within and their numbers, in order."""
+def _check_numbers(
+    folder: Path, color: Sequence[Path], numbers: Sequence[int], others: Sequence[int]
+) -> None:
+    """Raise UserError where pictures are counted, and the numbers of those that are paired by order
+    contradict each other, as where one of either is missing. Counts may begin differently.
+    """
+    apart = [other - number for number, other in zip(numbers, others, strict=True)]
+    if len({*apart}) > 1:
+        i = next(i for i, each in enumerate(apart) if each != apart[0])
+        raise UserError(
+            f"frames={folder}: rgb/{color[i].name} would be paired by order with number "
+            f"{others[i]} in depth/: is number {numbers[i] + apart[0]} missing? Name both alike"
+        )
+
+
+def _list_pictures(
+    folder: Path, name: str, endings: Sequence[str]
+) -> tuple[list[Path], list[int] | None]:
+    """Return the pictures of a folder within, in order, and their numbers; None: they have none."""
     inner = folder / name
     if not inner.is_dir():
         raise UserError(f"frames={folder}: has no folder {name}/; expected rgb/ and depth/")
-    found = sorted(inner / one for one in list_folder(inner) if Path(one).suffix.lower() in endings)
+    names = [one for one in list_folder(inner) if not one.startswith(".")]  # as macOS adds
+    found = sorted(inner / one for one in names if Path(one).suffix.lower() in endings)
+    by_stem = dict[str, Path]()
+    for path in found:
+        if (twin := by_stem.setdefault(path.stem, path)) is not path:
+            raise UserError(
+                f"frames={folder}: {name}/{twin.name} and {name}/{path.name} are of one name"
+            )
     if not found:
         raise UserError(f"frames={folder}: no pictures in {name}/ ({', '.join(endings)})")
+    if all(re.fullmatch(r"\d+\.\d+", path.stem) for path in found):  # times: .5 is after .25
+        return sorted(found, key=lambda path: float(path.stem)), None
     numbers = number_names([path.stem for path in found])
     if numbers is None:
-        return found, [*range(len(found))]
+        return found, None
     order = sorted(range(len(found)), key=numbers.__getitem__)
     return [found[i] for i in order], [numbers[i] for i in order]

@@ -9,11 +9,13 @@ from typing import Any
 
 import cv2
 import numpy as np
+from PIL import ExifTags, Image
 
 from posefilter.data.frames import SATURATED
 from posefilter.errors import BadData
 from posefilter.limits import check_picture, read_bytes
 
+_TURNS = range(2, 9)  # of EXIF; 1: none
 _PNG, _JPEG = b"\x89PNG\r\n\x1a\n", b"\xff\xd8"
 
 
@@ -21,9 +23,12 @@ def read_color(path: Path) -> np.ndarray:
     """Read a color image; gray is spread to three channels, alpha dropped.  -> (H, W, 3) uint8
     RGB.
     """
-    image = _read_image(path)
+    data = read_bytes(path)
+    image = decode_image(data, path)
+    _check_upright(data, path)
     if image.dtype != np.uint8:
-        raise BadData(path, "color image is not 8-bit", f"found {image.dtype}")
+        found = f"found {image.dtype}; is it the depth?"
+        raise BadData(path, "color image is not 8-bit", found)
     if image.ndim == 2:
         return np.repeat(image[..., None], 3, axis=-1)
     return np.ascontiguousarray(image[..., 2::-1])
@@ -39,20 +44,24 @@ def read_depth(path: Path, units: float, scaled_floats: bool = False) -> np.ndar
         scaled_floats: Floats are in `units`, too, as BOP's `depth_scale` has it.
 
     Returns:
-        Depth (H, W) float32 [m], 0 where unknown: saturated pixels count as that, and floats that
-        are NaN or infinite.
+        Depth (H, W) float32 [m], 0 where unknown: saturated pixels count as that, floats that are
+        NaN or infinite, and what is negative.
 
     Raises:
-        BadData: The file is not such, or holds negative depth.
+        BadData: The file is not such, or most of its depth is negative.
     """
-    image = _read_array(path) if path.suffix == ".npy" else _read_image(path)
+    is_array = path.suffix.lower() == ".npy"
+    image = _read_array(path) if is_array else _read_image(path)
     image = image[..., 0] if image.ndim == 3 and image.shape[2] == 1 else image
-    if image.ndim == 2 and (image.dtype.kind == "f" or path.suffix == ".npy"):
-        if image.dtype.kind not in "fui":
-            raise BadData(path, "depth is not numbers", f"found {image.dtype}")
+    image = image[0] if image.ndim == 3 and image.shape[0] == 1 else image
+    if is_array and (image.ndim != 2 or image.dtype.kind not in "fui"):
+        found = f"found {image.dtype} {image.shape}"
+        raise BadData(path, "depth is no array (H, W) of numbers", found)
+    if image.ndim == 2 and (image.dtype.kind in "fi" or is_array):
         image = np.where(np.isfinite(image), image, 0) if image.dtype.kind == "f" else image
-        if (image < 0).any():
-            raise BadData(path, "depth is negative", f"{image.min()}")
+        if np.count_nonzero(image < 0) > np.count_nonzero(image > 0):  # else it is what is unknown
+            raise BadData(path, "depth is negative", f"{image.min()}; along -z?")
+        image = np.maximum(image, 0)
         if (image > np.finfo(np.float32).max).any():
             raise BadData(path, "depth is too large", f"{image.max()}")
         if image.dtype.kind == "f" and not scaled_floats:
@@ -68,7 +77,7 @@ def read_depth(path: Path, units: float, scaled_floats: bool = False) -> np.ndar
 
 def holds_meters(path: Path) -> bool:
     """Tell whether a depth file that can be read holds floats, which are meters."""
-    image = _read_array(path) if path.suffix == ".npy" else _read_image(path)
+    image = _read_array(path) if path.suffix.lower() == ".npy" else _read_image(path)
     return image.dtype.kind == "f"
 
 
@@ -192,6 +201,22 @@ def _read_array(path: Path) -> np.ndarray:
     except Exception as error:  # the header decides what breaks: its parser raises anything
         raise BadData(path, "not readable as a NumPy array", f"truncated? {error}") from error
     return array.reshape(shape, order="F" if fortran else "C")
+
+
+def _check_upright(data: bytes, path: Path) -> None:
+    """Raise BadData where a JPEG is stored turned, as phones do: viewers show it otherwise than it
+    is read, and the depth and the intrinsics are of one or of the other.
+    """
+    if data[:2] != _JPEG or b"Exif\0\0" not in data[: 1 << 16]:
+        return
+    with Image.open(io.BytesIO(data)) as image:
+        turned = image.getexif().get(ExifTags.Base.Orientation, 1)
+    if turned in _TURNS:
+        raise BadData(
+            path,
+            f"is stored turned (EXIF orientation {turned})",
+            "save it as it is shown, with depth and intrinsics to match",
+        )
 
 
 def _flaw(data: bytes) -> str:
