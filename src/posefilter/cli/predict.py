@@ -19,6 +19,7 @@ from posefilter.cli.results import write_json
 from posefilter.cli.shapes import load_shape, open_shapes
 from posefilter.confidence.tolerance import PoseTolerance, read_pose_tolerance
 from posefilter.confidence.verdicts import Costs, describe_probability
+from posefilter.data.camera_files import CameraFile, read_camera_file
 from posefilter.data.readers.decode import holds_meters, read_color, read_depth
 from posefilter.errors import NotThere, UserError
 from posefilter.estimator import Estimator
@@ -328,7 +329,14 @@ def read_inputs(cfg: DictConfig) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     Raises UserError where one is missing or they do not fit each other.
     """
     rgb, depth = read_photograph(cfg.rgb, cfg.depth, cfg.depth_scale)
-    K = read_intrinsics(cfg.intrinsics)
+    camera = read_intrinsics(cfg.intrinsics, cfg.distortion is not None)
+    K, (height, width) = camera.K, depth.shape
+    if camera.size not in (None, (height, width)):
+        assert camera.size is not None
+        raise UserError(
+            f"intrinsics={cfg.intrinsics}: are of images of {camera.size[1]}x{camera.size[0]} "
+            f"pixels, but the color image has {width}x{height}"
+        )
     if cfg.distortion is not None:
         rgb, depth = undistort(rgb, depth, K, parse_distortion(cfg.distortion))
     return rgb, depth, K
@@ -367,15 +375,55 @@ def read_photograph(rgb: str, depth: str, depth_scale: float) -> tuple[np.ndarra
     return color, z
 
 
-def read_intrinsics(numbers: Any) -> np.ndarray:
-    """Return K (3, 3) float64 [px] of fx, fy, cx, cy.  Raises UserError where they are none."""
-    parts = list(numbers) if isinstance(numbers, ListConfig | list) else str(numbers).split(",")
+def read_intrinsics(typed: Any, distorted: bool = False) -> CameraFile:
+    """Return a camera: of fx, fy, cx, cy [px], of a matrix's nine numbers, or of a file.
+
+    Args:
+        typed: The setting.
+        distorted: Whether the distortion of the lens is typed beside it.
+
+    Raises:
+        UserError: It is none of these; or the file tells a distortion, and none is typed: it does
+            not tell whether the images are rectified.
+    """
+    parts = list(typed) if isinstance(typed, ListConfig | list) else str(typed).split(",")
     try:
-        fx, fy, cx, cy = (float(part) for part in parts)
+        values = [float(part) for part in parts]
     except (TypeError, ValueError) as error:
-        raise UserError(f"intrinsics={numbers}: expected four numbers, fx,fy,cx,cy [px]") from error
-    if not np.isfinite([fx, fy, cx, cy]).all():
-        raise UserError(f"intrinsics={numbers}: hold NaN or infinity")
+        if len(parts) > 1 or not Path(str(parts[0])).exists():
+            raise UserError(
+                f"intrinsics={typed}: expected four numbers, fx,fy,cx,cy [px], or a camera's file"
+            ) from error
+        return _read_camera(Path(str(parts[0])), distorted)
+    if len(values) == 9:
+        fx, skew, cx, below, fy, cy, *last = values
+        if (below, *last) != (0, 0, 0, 1) or abs(skew) > 0:
+            raise UserError(f"intrinsics={typed}: is no matrix fx,0,cx,0,fy,cy,0,0,1")
+        values = [fx, fy, cx, cy]
+    if len(values) != 4:
+        raise UserError(f"intrinsics={typed}: expected four numbers, fx,fy,cx,cy [px]")
+    fx, fy, cx, cy = values
+    if not np.isfinite(values).all():
+        raise UserError(f"intrinsics={typed}: hold NaN or infinity")
     if fx <= 0 or fy <= 0:
-        raise UserError(f"intrinsics={numbers}: focal lengths must be positive [px]")
-    return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
+        raise UserError(f"intrinsics={typed}: focal lengths must be positive [px]")
+    return CameraFile(np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]))
+
+
+def _read_camera(path: Path, distorted: bool) -> CameraFile:
+    """Return a file's camera.  Raises UserError where it must be said whether images are raw."""
+    camera = read_camera_file(path)
+    if camera.distortion and not distorted:
+        raw = f"intrinsics={_list_numbers(camera.K)} distortion=" + ",".join(
+            f"{one:g}" for one in camera.distortion
+        )
+        better = camera.K if camera.rectified is None else camera.rectified
+        raise UserError(
+            f"intrinsics={path}: tells a distortion of the lens; of rectified images type "
+            f"intrinsics={_list_numbers(better)}, of raw ones {raw}"
+        )
+    return camera
+
+
+def _list_numbers(K: np.ndarray) -> str:
+    return ",".join(f"{one:.8g}" for one in (K[0, 0], K[1, 1], K[0, 2], K[1, 2]))

@@ -244,9 +244,11 @@ def open_videos(cfg: DictConfig, objects: Sequence[str]) -> tuple[Sequence[Video
     """
     data = cfg.get("data")
     if cfg.frames:
-        K, scale = read_intrinsics(cfg.intrinsics), float(cfg.depth_scale or _DEPTH_SCALE)
+        camera = read_intrinsics(cfg.intrinsics, cfg.distortion is not None)
+        scale = float(cfg.depth_scale or _DEPTH_SCALE)
         lens = None if cfg.distortion is None else parse_distortion(cfg.distortion)
-        video = FolderVideo(Path(str(cfg.frames)), K, scale, cfg.stride, lens)
+        folder = Path(str(cfg.frames))
+        video = FolderVideo(folder, camera.K, scale, cfg.stride, lens, camera.size)
         return [video], lambda _: np.eye(4)
     names = list(objects)
     meshes = open_meshes(data.meshes, data.mesh_scale, data.source, names)

@@ -79,6 +79,7 @@ class FolderVideo(Video):
         depth_scale: Units of the depth images in a meter.
         stride: Take every so many frames.
         distortion: Of the lens, see `undistort`; None: the pictures are rectified.
+        size: Height and width that the intrinsics are of [px]; None: that is not known.
 
     Raises:
         UserError: A folder is missing or empty, or the pictures do not pair.
@@ -94,9 +95,10 @@ class FolderVideo(Video):
         depth_scale: float,
         stride: int = 1,
         distortion: tuple[float, ...] | None = None,
+        size: tuple[int, int] | None = None,
     ) -> None:
         self.name, self._K, self._scale = folder.name, intrinsics, depth_scale
-        self._distortion = distortion
+        self._distortion, self._size = distortion, size
         self.ids: dict[str, int] = {}
         color, numbers = _list_pictures(folder, "rgb", _COLOR)
         depth, others = _list_pictures(folder, "depth", _DEPTH)
@@ -130,6 +132,8 @@ class FolderVideo(Video):
         number, color, depth = self._frames[index]
         rgb, z = read_color(color), read_depth(depth, self._scale)
         expect_size(depth, z, rgb.shape[0], rgb.shape[1], color.name)
+        if self._size is not None:
+            expect_size(color, rgb, *self._size, "the camera's file")
         if self._distortion is not None:
             rgb, z = undistort(rgb, z, self._K, self._distortion)
         return VideoFrame(color.stem, number, rgb, z, self._K, {})

@@ -1,0 +1,136 @@
+"""Read a camera's intrinsics from the files that cameras, calibrations and datasets come with."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from posefilter.data.readers.decode import numbers, whole_number
+from posefilter.errors import BadData
+from posefilter.limits import read_json, read_lines, read_yaml
+
+_LARGEST = 1 << 24  # bytes
+_PAIRS = (("cx", "cy"), ("ppx", "ppy"))  # of the principal point
+_MATRICES = ("camera_matrix", "intrinsic_matrix", "cam_K", "K", "k")
+_INNER = ("intrinsic", "intrinsics", "camera", "depth_intrinsics", "color_intrinsics")
+_DISTORTIONS = ("distortion_coefficients", "coeffs", "dist_coeffs", "distortion", "D", "d")
+_PROJECTIONS = ("projection_matrix", "P", "p")
+_SIZES = (("width", "height"), ("image_width", "image_height"), ("w", "h"))
+
+
+class CameraFile(NamedTuple):
+    """What a file says of a camera.
+
+    Attributes:
+        K: Camera matrix (3, 3), float64 [px].
+        size: Height and width of its images [px], where the file says so.
+        distortion: Of its lens, in OpenCV's order; empty where there is none.
+        rectified: Camera matrix of its rectified images, where the file has one.
+    """
+
+    K: np.ndarray
+    size: tuple[int, int] | None = None
+    distortion: tuple[float, ...] = ()
+    rectified: np.ndarray | None = None
+
+
+def read_camera_file(path: Path) -> CameraFile:
+    """Read JSON, YAML, or a text of a matrix (3, 3) or of fx, fy, cx, cy.
+
+    Known are fx, fy, cx, cy by name (BOP's `camera.json`, RealSense with ppx, ppy), a matrix of
+    nine numbers, by rows or by columns (Open3D), ROS's camera_info and its calibration files, and
+    BOP's `scene_camera.json` where all images have one camera.
+
+    Raises:
+        BadData: The file is missing, of none of these forms, or no camera's.
+    """
+    ending = path.suffix.lower()
+    if ending in (".yaml", ".yml"):
+        return _of_mapping(read_yaml(path, _LARGEST), path)
+    if ending == ".json":
+        return _of_mapping(read_json(path, _LARGEST), path)
+    words = " ".join(read_lines(path)).translate(str.maketrans(",;[]()", "      ")).split()
+    found = {"numbers": words}
+    if len(words) == 4:
+        fx, fy, cx, cy = numbers(found, "numbers", path, (4,)).tolist()
+        return CameraFile(_matrix(fx, fy, cx, cy, path))
+    if len(words) == 9:
+        return CameraFile(_orient(numbers(found, "numbers", path, (3, 3)), path))
+    raise BadData(path, "holds no camera", f"{len(words)} words; expected a matrix (3, 3)")
+
+
+def _of_mapping(content: Any, path: Path) -> CameraFile:
+    if not isinstance(content, Mapping):
+        raise BadData(path, "holds no camera", "expected fx, fy, cx, cy or a matrix by name")
+    inner = (content[key] for key in _INNER if isinstance(content.get(key), Mapping))
+    for one in (content, *inner):
+        K = _find_matrix(one, path)
+        if K is not None:
+            return _of_camera(one, K, path)
+    images = [one for one in content.values() if isinstance(one, Mapping) and "cam_K" in one]
+    if images and len(images) == len(content):
+        cameras = np.stack([numbers(one, "cam_K", path, (3, 3)) for one in images])
+        if np.ptp(cameras, axis=0).max() > 1e-6:
+            raise BadData(path, "has another camera for each image", "type its numbers")
+        return CameraFile(_orient(cameras[0], path))
+    some = ", ".join(map(str, [*content][:6]))
+    raise BadData(path, "holds no camera", f"expected fx, fy, cx, cy or a matrix; it has {some}")
+
+
+def _of_camera(content: Mapping[str, Any], K: np.ndarray, path: Path) -> CameraFile:
+    """Return a camera with what a mapping says beside its matrix."""
+    size = None
+    for width, height in _SIZES:
+        if width in content and height in content:
+            size = (whole_number(content, height, path), whole_number(content, width, path))
+            break
+    distortion = _listed(content, _DISTORTIONS)
+    coefficients = () if distortion is None else _flat(distortion["data"], path)
+    projection = _listed(content, _PROJECTIONS)
+    P = None if projection is None else numbers(projection, "data", path, (3, 4))
+    return CameraFile(
+        K,
+        size,
+        coefficients if any(coefficients) else (),
+        None if P is None or P[0, 0] <= 0 else P[:, :3],
+    )
+
+
+def _find_matrix(content: Mapping[str, Any], path: Path) -> np.ndarray | None:
+    """Return the camera matrix (3, 3) of a mapping; None where it has none."""
+    for x, y in _PAIRS:
+        if all(key in content for key in ("fx", "fy", x, y)):
+            fx, fy, cx, cy = (float(numbers(content, key, path, ())) for key in ("fx", "fy", x, y))
+            return _matrix(fx, fy, cx, cy, path)
+    found = _listed(content, _MATRICES)
+    return None if found is None else _orient(numbers(found, "data", path, (3, 3)), path)
+
+
+def _listed(content: Mapping[str, Any], keys: tuple[str, ...]) -> dict[str, Any] | None:
+    """Return a list of numbers by the first of the keys that is there, as {"data": ...}."""
+    for key in keys:
+        value = content.get(key)
+        value = value.get("data") if isinstance(value, Mapping) else value
+        if isinstance(value, list):
+            return {"data": value}
+    return None
+
+
+def _flat(value: Any, path: Path) -> tuple[float, ...]:
+    count = np.asarray(value, dtype=object).size
+    return tuple(numbers({"data": value}, "data", path, (count,)).tolist())
+
+
+def _matrix(fx: float, fy: float, cx: float, cy: float, path: Path) -> np.ndarray:
+    return _orient(np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]]), path)
+
+
+def _orient(matrix: np.ndarray, path: Path) -> np.ndarray:
+    """Return a camera matrix that is written by rows or by columns; only one of them ends in the
+    row 0, 0, 1.
+    """
+    K = matrix if np.allclose(matrix[2], (0, 0, 1)) else matrix.T
+    if not np.allclose(K[2], (0, 0, 1)) or min(K[0, 0], K[1, 1]) <= 0:
+        raise BadData(path, "holds no camera matrix", f"found {matrix.tolist()}")
+    return np.array(K)

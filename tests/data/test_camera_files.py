@@ -1,0 +1,118 @@
+"""Intrinsics out of the files that cameras, calibrations and datasets come with."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from posefilter.cli.predict import read_intrinsics
+from posefilter.data.camera_files import read_camera_file
+from posefilter.errors import BadData, UserError
+
+K = np.array([[1066.778, 0, 312.9869], [0, 1067.487, 241.3109], [0, 0, 1]])
+FOUR = {"fx": K[0, 0], "fy": K[1, 1], "cx": K[0, 2], "cy": K[1, 2]}
+REALSENSE = {"width": 640, "height": 480, "fx": K[0, 0], "fy": K[1, 1], "ppx": K[0, 2]}
+REALSENSE |= {"ppy": K[1, 2], "model": "distortion.brown_conrady", "coeffs": [0.0] * 5}
+ROS = f"""
+image_width: 640
+image_height: 480
+camera_name: camera
+camera_matrix: {{rows: 3, cols: 3, data: {K.ravel().tolist()}}}
+distortion_model: plumb_bob
+distortion_coefficients: {{rows: 1, cols: 5, data: [0, 0, 0, 0, 0]}}
+projection_matrix: {{rows: 3, cols: 4, data: {np.c_[K, np.zeros(3)].ravel().tolist()}}}
+"""
+SIZE = (480, 640)
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "size"),
+    [
+        ("bop.json", FOUR | {"depth_scale": 0.1, "width": 640, "height": 480}, SIZE),
+        ("realsense.json", REALSENSE, SIZE),
+        ("inner.json", {"intrinsics": REALSENSE}, SIZE),
+        ("open3d.json", {"width": 640, "height": 480, "intrinsic_matrix": K.T.ravel()}, SIZE),
+        (
+            "parameters.json",
+            {"extrinsic": [1], "intrinsic": {"intrinsic_matrix": K.T.ravel()}},
+            None,
+        ),
+        ("rows.json", {"K": K}, None),
+        ("scene_camera.json", {"0": {"cam_K": K.ravel()}, "7": {"cam_K": K.ravel()}}, None),
+        ("info.yaml", f"height: 480\nwidth: 640\nk: {K.ravel().tolist()}\nd: []\n", SIZE),
+        ("calibration.yml", ROS, SIZE),
+        ("matrix.txt", "\n".join(" ".join(map(str, row)) for row in K), None),
+        ("matrix.csv", str(K.tolist()), None),
+        ("four.txt", "1066.778 1067.487, 312.9869 241.3109\n", None),
+    ],
+)
+def test_a_camera_is_read_of_any_form(
+    name: str, content: Any, size: tuple[int, int] | None, tmp_path: Path
+) -> None:
+    path = tmp_path / name
+    text = content if isinstance(content, str) else json.dumps(content, default=np.ndarray.tolist)
+    path.write_text(text)
+    camera = read_intrinsics(str(path))
+    np.testing.assert_array_equal(camera.K, K)
+    assert camera.size == size
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "told"),
+    [
+        ("a.json", "[1, 2]", "holds no camera"),
+        ("a.json", '{"width": 640}', r"expected fx, fy, cx, cy or a matrix; it has width"),
+        ("a.json", '{"K": [1, 2, 3]}', "wrong size"),
+        ("a.json", '{"fx": "a", "fy": 1, "cx": 1, "cy": 1}', "'fx' is not numbers"),
+        ("a.json", '{"fx": -1, "fy": 1, "cx": 1, "cy": 1}', "no camera matrix"),
+        ("a.json", "{", "not readable as JSON"),
+        ("a.json", json.dumps(FOUR | {"width": "x", "height": 1}), "'width' is not numbers"),
+        ("a.json", json.dumps(FOUR | {"width": 1.5, "height": 1}), "should be a whole number"),
+        ("a.yaml", "a: [", "is no YAML"),
+        ("a.txt", "1 2 3", "3 words"),
+        ("a.txt", "1 2 3 4 5 6 7 8 9", "no camera matrix"),
+    ],
+)
+def test_what_is_no_camera_is_told(name: str, content: str, told: str, tmp_path: Path) -> None:
+    (tmp_path / name).write_text(content)
+    with pytest.raises(BadData, match=told) as caught:
+        read_camera_file(tmp_path / name)
+    assert name in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_cameras_that_differ_from_image_to_image_are_told(tmp_path: Path) -> None:
+    other = K + np.array([[1, 0, 0], [0, 0, 0], [0, 0, 0]])
+    content = {"0": {"cam_K": K.ravel().tolist()}, "1": {"cam_K": other.ravel().tolist()}}
+    (tmp_path / "scene_camera.json").write_text(json.dumps(content))
+    with pytest.raises(BadData, match="has another camera for each image"):
+        read_camera_file(tmp_path / "scene_camera.json")
+
+
+def test_a_distortion_is_not_passed_over(tmp_path: Path) -> None:
+    """What the message advises is read, either way."""
+    path = tmp_path / "camera.yaml"
+    path.write_text(
+        ROS.replace("[0, 0, 0, 0, 0]", "[0.1, -0.2, 0, 0, 0]").replace("1066.778", "900", 1)
+    )
+    with pytest.raises(UserError, match="tells a distortion of the lens") as caught:
+        read_intrinsics(str(path))
+    rectified, raw = (part.split(" ")[0] for part in str(caught.value).split("intrinsics=")[2:])
+    np.testing.assert_allclose(read_intrinsics(rectified.rstrip(",")).K, K)
+    assert read_intrinsics(raw).K[0, 0] == 900
+    assert "distortion=0.1,-0.2,0,0,0" in str(caught.value)
+    assert read_intrinsics(str(path), distorted=True).K[0, 0] == 900
+
+
+def test_numbers_are_four_or_a_matrix() -> None:
+    for typed in (
+        "1066.778,1067.487,312.9869,241.3109",
+        [*K.ravel()],
+        "1066.778,0,312.9869,0,1067.487,241.3109,0,0,1",
+    ):
+        np.testing.assert_array_equal(read_intrinsics(typed).K, K)
+    for wrong in ("1,2,3", [*K.T.ravel()], "none.json", "1,2,x,4", None):
+        with pytest.raises(UserError, match=r"^intrinsics="):
+            read_intrinsics(wrong)
