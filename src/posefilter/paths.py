@@ -56,7 +56,8 @@ def check_inside(path: Path, root: Path) -> Path:
     real = os.path.realpath(path) if path.is_symlink() else f"{folder}/{path.name}"
     if path.name == ".." or os.path.commonpath([real, home]) != home:
         raise UserError(
-            f"{path}: leads out of {root}; what a dataset or mesh names must lie in its own folder"
+            f"{path}: leads out of {root}; what a dataset or mesh names must lie in its own "
+            "folder: name the folder that it leads to instead"
         )
     return path
 

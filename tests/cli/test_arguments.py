@@ -351,3 +351,16 @@ def test_advice_for_lists_of_numbers_is_their_form(
 ) -> None:
     assert run_command("predict", HOME, ["rgb=a.png", "depth=b.png", typed]) == 2
     assert "it is typed intrinsics=fx,fy,cx,cy" in capfd.readouterr().err
+
+
+@pytest.mark.parametrize(
+    "name", ["IMG (1).png", "a,b.png", "[a].png", "it's.png", "a {b}.png", "a b"]
+)
+def test_a_file_that_is_there_needs_no_quotes(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / name).touch()
+    (parsed,) = OverridesParser.create().parse_overrides(quoted([f"rgb={name}"]))
+    assert parsed.value() == name
+    assert quoted([f"seed={name}"]) == [f"seed={name}"]  # no setting that names a file

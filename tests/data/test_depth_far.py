@@ -5,8 +5,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from omegaconf import OmegaConf
 
-from posefilter.cli.predict import read_photograph
+from posefilter.cli.predict import read_inputs, read_photograph
 from posefilter.errors import UserError
 from posefilter.images import check_images, drop_unknown
 
@@ -59,3 +60,13 @@ def test_files_may_say_so_as_arrays_do(name: str, tmp_path: Path) -> None:
     np.save(tmp_path / "mm.npy", np.full((40, 60), 800.0))
     with pytest.raises(UserError, match="its floats should be meters"):
         read_photograph(str(color), str(tmp_path / "mm.npy"), 1000.0)
+
+
+def test_a_distortion_that_no_lens_has_is_named(tmp_path: Path) -> None:
+    np.save(tmp_path / "depth.npy", np.full((40, 60), 0.8))
+    assert cv2.imwrite(str(tmp_path / "a.png"), RGB)
+    files = {"rgb": str(tmp_path / "a.png"), "depth": str(tmp_path / "depth.npy")}
+    given = {**files, "depth_scale": 1000, "intrinsics": "60,60,30,20"}
+    read_inputs(OmegaConf.create({**given, "distortion": "0.1,0,0,0"}))
+    with pytest.raises(UserError, match=r"^distortion=1e9,0,0,0: without it, .* % of the depth is"):
+        read_inputs(OmegaConf.create({**given, "distortion": "1e9,0,0,0"}))

@@ -114,7 +114,10 @@ def quoted(arguments: Sequence[str]) -> list[str]:
         odd = re.search(r"[^\x20-\x7e]|[=#&;!^`~]", value) is not None
         is_place = key.lstrip("+~").rpartition(".")[2] in _PLACES
         odd |= is_place and _NUMBER.fullmatch(value) is not None
-        if odd and re.fullmatch(r"[+~]{0,2}[\w./@]+", key) and not _written(value):
+        signs = re.search(r"[][(){}'\", ]", value) is not None and "${" not in value
+        if is_place and signs and _exists(value):  # such as "IMG (1).png"
+            argument = f"{key}='" + value.replace("'", "\\'") + "'"
+        elif odd and re.fullmatch(r"[+~]{0,2}[\w./@]+", key) and not _written(value):
             values = [value] if _exists(value) else value.split(",")
             parts = (part.replace("'", "\\'") for part in values)
             argument = f"{key}=" + ",".join(f"'{part}'" for part in parts)

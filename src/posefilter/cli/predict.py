@@ -44,6 +44,7 @@ _PROBABILITY = (
     "that the object is in the image and the pose within 0.1 diameters (ADD), calibrated on "
     "validation scenes of which half showed the object; presence: that it is in the image"
 )
+_LEFT = 0.5  # of the depth, of images without distortion
 _SURFACE = PoseTolerance(add_s=0.1)
 _CALIBRATED = (
     "where the pose is if the estimate is right (within 0.1 diameters), as wide as the errors of "
@@ -338,7 +339,14 @@ def read_inputs(cfg: DictConfig) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
             f"pixels, but the color image has {width}x{height}"
         )
     if cfg.distortion is not None:
+        before = np.count_nonzero(depth)
         rgb, depth = undistort(rgb, depth, K, parse_distortion(cfg.distortion))
+        left = np.count_nonzero(depth) / before
+        if left < _LEFT:
+            raise UserError(
+                f"distortion={cfg.distortion}: without it, {100 * left:.1f} % of the depth is left; "
+                "are these the lens's coefficients, in this order?"
+            )
     return rgb, depth, K
 
 
