@@ -344,8 +344,8 @@ def read_inputs(cfg: DictConfig) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         left = np.count_nonzero(depth) / before
         if left < _LEFT:
             raise UserError(
-                f"distortion={cfg.distortion}: without it, {100 * left:.1f} % of the depth is left; "
-                "are these the lens's coefficients, in this order?"
+                f"distortion={cfg.distortion}: without it, {100 * left:.1f} % of the depth "
+                "is left; are these the lens's coefficients, in this order?"
             )
     return rgb, depth, K
 
