@@ -64,6 +64,10 @@ def convert_bag(job: Job) -> None:
                     tally.warned = len(reader.warnings)
                     done = reader.unpaired + reader.early + len(reader.skipped)
                     bar.update(task, completed=tally.images + done)
+                if not tally.images:
+                    raise UserError(f"bag={cfg.bag}: {reader.explain_none()}")
+                if cfg.copy_messages:
+                    writer.copy(reader.messages())
             except (UserError, KeyboardInterrupt, Stopped) as error:
                 kept = f"the {writer.count} images before it are in {out}"
                 if writer.count and isinstance(error, UserError):
@@ -71,10 +75,6 @@ def convert_bag(job: Job) -> None:
                 if writer.count:
                     say(cfg.console, "warning", f"warning: stopped; {kept}", images=writer.count)
                 raise
-            if not tally.images:
-                raise UserError(f"bag={cfg.bag}: {reader.explain_none()}")
-            if cfg.copy_messages:
-                writer.copy(reader.messages())
     tell(tally, reader, cfg, out)
 
 
