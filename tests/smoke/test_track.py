@@ -244,6 +244,20 @@ def test_a_broken_frame_can_be_left_out(
         assert [row["im_id"] for row in csv.DictReader(file)] == ["8", "9", "11"]
 
 
+def test_a_frame_without_depth_can_be_left_out(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (folder / "depth" / "frame_9.png").unlink()
+    typed = [*COMMON, f"frames={folder}", CAMERA]
+    assert run_command("track", HOME, [*typed, f"out={tmp_path / 'none'}"]) == 2
+    assert "of 4, and the others have; on_error=skip leaves such" in capsys.readouterr().err
+    out = tmp_path / "out"
+    assert run_command("track", HOME, [*typed, f"out={out}", "on_error=skip"]) == 0
+    assert "frame_9.png: missing file" in capsys.readouterr().out
+    with (out / "poses.csv").open() as file:
+        assert [row["im_id"] for row in csv.DictReader(file)] == ["8", "10", "11"]
+
+
 def test_progress_counts_the_frames(
     folder: Path, tmp_path: Path, bar_tasks: Callable[[str], list[Any]]
 ) -> None:

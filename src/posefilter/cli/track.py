@@ -248,7 +248,8 @@ def open_videos(cfg: DictConfig, objects: Sequence[str]) -> tuple[Sequence[Video
         scale = float(cfg.depth_scale or _DEPTH_SCALE)
         lens = None if cfg.distortion is None else parse_distortion(cfg.distortion)
         folder = Path(str(cfg.frames))
-        video = FolderVideo(folder, camera.K, scale, cfg.stride, lens, camera.size)
+        skip = cfg.on_error == "skip"
+        video = FolderVideo(folder, camera.K, scale, cfg.stride, lens, camera.size, skip)
         return [video], lambda _: np.eye(4)
     names = list(objects)
     meshes = open_meshes(data.meshes, data.mesh_scale, data.source, names)

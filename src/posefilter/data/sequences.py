@@ -80,6 +80,7 @@ class FolderVideo(Video):
         stride: Take every so many frames.
         distortion: Of the lens, see `undistort`; None: the pictures are rectified.
         size: Height and width that the intrinsics are of [px]; None: that is not known.
+        skip: Let color pictures without depth be, where others have some: reading them fails.
 
     Raises:
         UserError: A folder is missing or empty, or the pictures do not pair.
@@ -96,6 +97,7 @@ class FolderVideo(Video):
         stride: int = 1,
         distortion: tuple[float, ...] | None = None,
         size: tuple[int, int] | None = None,
+        skip: bool = False,
     ) -> None:
         self.name, self._K, self._scale = folder.name, intrinsics, depth_scale
         self._distortion, self._size = distortion, size
@@ -103,13 +105,16 @@ class FolderVideo(Video):
         color, numbers = _list_pictures(folder, "rgb", _COLOR)
         depth, others = _list_pictures(folder, "depth", _DEPTH)
         by_stem = {path.stem: path for path in depth}
-        if all(path.stem in by_stem for path in color):
-            depth = [by_stem[path.stem] for path in color]
-        elif any(path.stem in by_stem for path in color):
-            alone = [path.name for path in color if path.stem not in by_stem]
+        alone = [path.name for path in color if path.stem not in by_stem]
+        if not alone or (skip and len(alone) < len(color)):
+            depth = [
+                by_stem.get(path.stem, folder / "depth" / f"{path.stem}.png") for path in color
+            ]
+        elif len(alone) < len(color):
             raise UserError(
                 f"frames={folder}: rgb/{alone[0]} has no picture of its name in depth/, as "
-                f"{len(alone)} of {len(color)}, and the others have"
+                f"{len(alone)} of {len(color)}, and the others have; on_error=skip leaves such "
+                "frames out"
             )
         elif len(color) != len(depth):
             raise UserError(
