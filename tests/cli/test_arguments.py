@@ -333,15 +333,28 @@ def test_a_run_goes_on_that_was_begun_with_a_setting_that_nothing_reads(
 
 
 @pytest.mark.parametrize("name", ["1.10", "2024_05_02", "1e5", "007", "1.", ".5"])
-@pytest.mark.parametrize("key", ["out", "data.root", "+frames", "generate.meshes"])
+@pytest.mark.parametrize("key", ["out", "data.root", "+rgb", "generate.meshes"])
 def test_a_folder_that_is_named_by_a_number_is_taken_as_it_is_typed(key: str, name: str) -> None:
     """As a number 1.10 would be 1.1: another folder, whose results would be replaced."""
     (parsed,) = OverridesParser.create().parse_overrides(quoted([f"{key}={name}"]))
     assert parsed.value() == name
 
 
+def test_frames_are_a_folder_of_track_and_a_number_elsewhere() -> None:
+    assert quoted(["frames=2024_06_01"], "track") == ["frames='2024_06_01'"]
+    assert quoted(["frames=12"], "onboard") == ["frames=12"]
+
+
 def test_numbers_of_other_settings_stay_numbers() -> None:
-    typed = ["seed=3", "optimizer.lr=1e-3", "out=null", "checkpoint=a.ckpt", "seed=1,2"]
+    typed = [
+        "seed=3",
+        "frames=12",
+        "model.net.depth=3",
+        "optimizer.lr=1e-3",
+        "out=null",
+        "checkpoint=a.ckpt",
+        "seed=1,2",
+    ]
     assert quoted(typed) == typed
 
 

@@ -18,11 +18,11 @@ _VALUED = (
 )
 _INFO = ("--info", "-i")
 _KINDS = ("all", "config", "defaults", "defaults-tree", "plugins", "searchpath")  # of information
-# settings that name files and folders, by their last word, and what Hydra reads as a number
+# settings that name files and folders, whatever the command, and what Hydra reads as a number
 _PLACES = (
-    *("out", "rgb", "depth", "frames", "meshes", "root", "checkpoint", "run", "mesh", "estimates"),
-    *("bag", "resume", "warm_start", "distractor_meshes", "targets", "absent", "cache_dir"),
-    *("model_points_dir", "name"),
+    *("out", "rgb", "depth", "bag", "mesh", "meshes", "name", "checkpoint", "resume", "warm_start"),
+    *("estimates", "targets", "absent", "run", "distractor_meshes", "data.root", "data.meshes"),
+    *("data.cache_dir", "data.model_points_dir", "generate.meshes", "data.generate.meshes"),
 )
 _NUMBER = re.compile(r"[+-]?[0-9_.]*[0-9][0-9_.]*([eE][+-]?[0-9_]+)?")
 _FOLDERS = ("run", "runs", "sweep", "out")  # of a report
@@ -100,7 +100,7 @@ def without_trace(arguments: list[str], name: str) -> list[str]:
     return left
 
 
-def quoted(arguments: Sequence[str]) -> list[str]:
+def quoted(arguments: Sequence[str], command: str = "") -> list[str]:
     """Return settings with quotes round values that Hydra's grammar has no place for, such as a
     folder with an umlaut in its name, and round names of files and folders that it would read as
     numbers: 1.10 would be 1.1, and 2024_05_02 be 20240502.
@@ -112,7 +112,7 @@ def quoted(arguments: Sequence[str]) -> list[str]:
     for argument in arguments:
         key, _, value = argument.partition("=")
         odd = re.search(r"[^\x20-\x7e]|[=#&;!^`~]", value) is not None
-        is_place = key.lstrip("+~").rpartition(".")[2] in _PLACES
+        is_place = key.lstrip("+~") in _PLACES or (command, key) == ("track", "frames")
         odd |= is_place and _NUMBER.fullmatch(value) is not None
         signs = re.search(r"[][(){}'\", ]", value) is not None and "${" not in value
         if is_place and signs and _exists(value):  # such as "IMG (1).png"

@@ -102,7 +102,7 @@ def run_command(name: str, home: Path | None = None, arguments: list[str] | None
         typed, arguments = arguments, with_resumed(arguments)
         check_choices(arguments, conf, name)  # a resumed run's too
         check_added(typed, conf, name, arguments)
-        arguments = quoted(loosen(arguments, name)) + logging_for(arguments)
+        arguments = quoted(loosen(arguments, name), name) + logging_for(arguments)
         arguments = told_apart(maximized(options_first(arguments)), name, conf)
         sys.argv = [sys.argv[0], *defer_settings(arguments, conf)]
         with stopped_by_sigterm():
