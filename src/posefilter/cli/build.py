@@ -59,6 +59,22 @@ def build_trainer(job: Job) -> Trainer:
         raise UserError("trainer.max_steps: is missing; must be a whole number, or -1 for no limit")
     if interval == 0 and not isinstance(interval, float):  # by a reference, too
         raise UserError("trainer.val_check_interval=0: must be 1 or more steps, or a share")
+    if isinstance(interval, float) and cfg.trainer.get("check_val_every_n_epoch") is None:
+        raise UserError(
+            f"trainer.val_check_interval={interval}: a share of an epoch needs "
+            "trainer.check_val_every_n_epoch=1; a whole number is of steps"
+        )
+    for name in ("fast_dev_run", "barebones"):
+        if cfg.trainer.get(name):
+            raise UserError(
+                f"trainer.{name}={cfg.trainer[name]}: writes no checkpoint, which the test needs; "
+                "debug=smoke is a short run"
+            )
+    if cfg.trainer.get("gradient_clip_algorithm") not in (None, "norm"):
+        raise UserError(
+            f"trainer.gradient_clip_algorithm={cfg.trainer.gradient_clip_algorithm}: gradients are "
+            "clipped by the norm of each network; leave it out"
+        )
     # else it would never be validated, and have no best checkpoint
     if isinstance(interval, int) and 0 < steps < interval:
         log.info(

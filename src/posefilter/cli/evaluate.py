@@ -21,6 +21,7 @@ from posefilter.cli.components import changed, changes, chosen
 from posefilter.cli.console import say, typed
 from posefilter.cli.folders import holds_evaluation, read_results
 from posefilter.cli.job import Job
+from posefilter.cli.learned import DATA, list_learned
 from posefilter.cli.machine import settle
 from posefilter.cli.progress_bar import progress
 from posefilter.cli.recipe import check_data
@@ -99,6 +100,7 @@ def _of_checkpoint(job: Job) -> tuple[dict[str, Any], dict[str, Path]]:
     data.setup("test")
     method.set_object(object_to_judge(data, method.object_model))
     warn_of_several(data, job.cfg.console)
+    warn_of_learned(str(job.cfg.checkpoint), data, job.cfg.console)
     records = Records()
     callbacks = [records, ErrorTable(job.folder), progress(job.cfg.console)]
     trainer = make_trainer(job.cfg.trainer, callbacks)
@@ -116,6 +118,17 @@ def _of_checkpoint(job: Job) -> tuple[dict[str, Any], dict[str, Path]]:
     source = Path(job.cfg.checkpoint)
     found = record(method.compute_metrics(), tested, data.describe(), source, device)
     return found, files
+
+
+def warn_of_learned(checkpoint: str, data: PoseDataModule, console: str) -> None:
+    """Say where test scenes are of those that the checkpoint's run has learned from."""
+    learned = list_learned(Path(checkpoint).parent.parent / DATA, data)
+    if learned:
+        sentence = (
+            f"warning: {len(learned)} of the scenes that are tested were learned from by this run "
+            f"({', '.join(learned[:3])}): the dataset or data.split has changed since"
+        )
+        say(console, "warning", sentence, learned=learned)
 
 
 def warn_of_several(data: PoseDataModule, console: str) -> None:

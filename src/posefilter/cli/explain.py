@@ -24,6 +24,16 @@ from posefilter.cli.renamed import rename_argument, rename_missing
 from posefilter.errors import find_reason
 
 # choices that packages of others bring
+# settings of Lightning's Trainer, which is not imported to tell a mistake
+LIGHTNINGS = (
+    *("accelerator", "accumulate_grad_batches", "benchmark", "check_val_every_n_epoch"),
+    *("default_root_dir", "detect_anomaly", "deterministic", "devices", "enable_model_summary"),
+    *("gradient_clip_val", "inference_mode", "limit_predict_batches", "limit_test_batches"),
+    *("limit_train_batches", "limit_val_batches", "log_every_n_steps", "max_epochs", "max_steps"),
+    *("max_time", "min_epochs", "min_steps", "num_nodes", "num_sanity_val_steps"),
+    *("overfit_batches", "precision", "profiler", "reload_dataloaders_every_n_epochs", "strategy"),
+    *("sync_batchnorm", "use_distributed_sampler", "val_check_interval"),
+)
 _FORMS = {"intrinsics": "fx,fy,cx,cy", "distortion": "k1,k2,p1,p2,k3"}  # of lists of numbers
 _EXTRA = ("optuna", "joblib", "submitit_local", "submitit_slurm")
 
@@ -105,6 +115,11 @@ def explain_hydra(error: BaseException, conf: Path, arguments: list[str]) -> str
         return f"{', '.join(chosen) or 'the sweep'}: has failed ({first_line(error)})"
     # a choice that is null or a number, and the like
     groups = [a for a in arguments if (conf / a.partition("=")[0].lstrip("+~")).is_dir()]
+    wrong = [a for a in groups if a.partition("=")[2].lower() in ("true", "false")]
+    for argument in wrong[:1]:
+        group = argument.partition("=")[0].lstrip("+~")
+        known = ", ".join(sorted(file.stem for file in (conf / group).glob("[!_]*.yaml")))
+        return f"{argument}: choose {known}"
     return f"{', '.join(groups) or 'the settings'}: cannot be read ({first_line(error)})"
 
 
@@ -126,6 +141,8 @@ def near(wrong: str, known: list[str]) -> str:
     """Return the nearest keys of the same last name; else the nearest of the same depth; else what
     the wrong key's section has.
     """
+    if wrong.startswith("trainer.") and wrong.removeprefix("trainer.") in LIGHTNINGS:
+        return f", by default; it is one of Lightning's: type +{wrong}=..."
     elsewhere = [key for key in known if re.split("[./]", key)[-1] == wrong.rpartition(".")[2]]
     if elsewhere:
         nearest = difflib.get_close_matches(wrong, elsewhere, n=2, cutoff=0)

@@ -20,6 +20,7 @@ from posefilter.cli.checkpoints import build_method, method_of, read_checkpoint,
 from posefilter.cli.console import is_installed, say, typed
 from posefilter.cli.folders import OWN_RESULTS
 from posefilter.cli.job import Job
+from posefilter.cli.learned import DATA, list_learned
 from posefilter.cli.machine import settle
 from posefilter.cli.ranks import is_follower
 from posefilter.cli.results import record, show, write_json
@@ -87,9 +88,26 @@ def build(job: Job) -> Run:
         said = "warm start from %s (%d files): %d tensors copied, %d left as drawn"
         log.info(said, job.cfg.warm_start, len(starts), copied, left)
     rehearse(method, data)
+    if find_begun(job) is not None:
+        check_scenes(job.folder / DATA, data)
     if not is_follower():
-        write_json(job.folder / "data.json", {**data.describe(), "split": data.split_record()})
+        write_json(job.folder / DATA, {**data.describe(), "split": data.split_record()})
     return Run(job, method, trainer, data)
+
+
+def check_scenes(record: Path, data: PoseDataModule) -> None:
+    """Refuse to go on where scenes that a run has learned from would be tested on.
+
+    Raises:
+        UserError: How many these are.
+    """
+    learned = list_learned(record, data)
+    if learned:
+        raise UserError(
+            f"data.root={data.root}: its scenes have changed since the run began, and "
+            f"{len(learned)} that it learned from would be tested on ({', '.join(learned[:3])}); "
+            "train anew in another out=, or undo the change"
+        )
 
 
 def rehearse(method: PoseEstimator, data: PoseDataModule) -> None:

@@ -87,6 +87,20 @@ def split_records(
     return out
 
 
+def find_learned(
+    before: Mapping[str, Mapping[str, int]], after: Mapping[str, Mapping[str, int]]
+) -> list[str]:
+    """Return the scenes that a division would test on, and an earlier one learned from or chose a
+    checkpoint by, without testing on them: where scenes came or went, others are shuffled.
+
+    Args:
+        before: Scenes of each part, as a training had them.
+        after: Scenes of each part now.
+    """
+    learned = {*before.get("train", {}), *before.get("val", {})} - {*before.get("test", {})}
+    return sorted(learned & {*after.get("test", {})})
+
+
 def _follow(name: str, split: Mapping[str, Share | None]) -> str:
     """Return the part whose frames a part has: itself, or the one that it names, and so on.
 

@@ -1,0 +1,24 @@
+"""Which scenes a run has learned from, against those that would be tested now."""
+
+from pathlib import Path
+
+from posefilter.data.module import PoseDataModule
+from posefilter.data.splits import find_learned
+from posefilter.limits import read_json
+
+DATA = "data.json"  # of a run: how its data were divided
+
+
+def list_learned(record: Path, data: PoseDataModule) -> list[str]:
+    """Return the scenes of the test split that a run has learned from, and did not test on.
+
+    Args:
+        record: Its data.json; there may be none.
+        data: What is tested; another dataset than the run's has none of its scenes.
+    """
+    before = read_json(record) if record.is_file() else None
+    split = before.get("split") if isinstance(before, dict) else None
+    if not isinstance(split, dict) or not all(isinstance(part, dict) for part in split.values()):
+        return []
+    same = Path(str(before["root"])).resolve() == data.root.resolve() if "root" in before else False
+    return find_learned(split, data.split_record()) if same else []
