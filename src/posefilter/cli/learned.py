@@ -17,8 +17,11 @@ def list_learned(record: Path, data: PoseDataModule) -> list[str]:
         data: What is tested; another dataset than the run's has none of its scenes.
     """
     before = read_json(record) if record.is_file() else None
-    split = before.get("split") if isinstance(before, dict) else None
+    if not isinstance(before, dict) or Path(str(before.get("root"))).resolve() != (
+        data.root.resolve()
+    ):
+        return []
+    split = before.get("split")
     if not isinstance(split, dict) or not all(isinstance(part, dict) for part in split.values()):
         return []
-    same = Path(str(before["root"])).resolve() == data.root.resolve() if "root" in before else False
-    return find_learned(split, data.split_record()) if same else []
+    return find_learned(split, data.split_record())
