@@ -1,6 +1,6 @@
 """The library's verbs: load what is trained, compose a configuration, build what it describes."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -76,7 +76,8 @@ def check_overrides(overrides: Sequence[str]) -> None:
     Raises:
         UserError: They are no list of texts, or one sets what is not the filter's.
     """
-    if isinstance(overrides, str) or not all(isinstance(one, str) for one in overrides):
+    listed = isinstance(overrides, Iterable) and not isinstance(overrides, str | Mapping)
+    if not listed or not all(isinstance(one, str) for one in overrides):
         raise UserError(
             f"overrides={overrides!r}: must be a list, such as ['filter.particles=1000']"
         )

@@ -392,6 +392,9 @@ def test_an_override_without_an_effect_is_refused(override: str, told: str) -> N
 def test_overrides_are_a_list() -> None:
     with pytest.raises(posefilter.UserError, match="must be a list"):
         posefilter.load(NAME, overrides="filter.particles=3")
+    for wrong in (None, {"filter.particles": 3}, 3, [3]):
+        with pytest.raises(posefilter.UserError, match="must be a list, such as"):
+            posefilter.load(NAME, overrides=wrong)
 
 
 def test_a_configuration_is_composed_and_built() -> None:

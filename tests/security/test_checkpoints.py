@@ -244,3 +244,16 @@ def test_a_calibration_as_it_should_be_is_read(content: dict[str, Any], save: Sa
     other = method_of(read_checkpoint(save(content)), {"filter": {"particles": 5}})
     assert other.calibration is None
     assert "another filter" in other.calibration_note
+
+
+@pytest.mark.parametrize("share", [0.3, 0.5, 0.8])
+def test_a_byte_that_is_not_what_was_written_is_told(share: float, tmp_path: Path) -> None:
+    """As of a copy that failed: torch looks at no checksum, and would load other numbers."""
+    shipped = Path(__file__).parents[2] / "weights" / "025_mug.ckpt"
+    content = bytearray(shipped.read_bytes())
+    content[int(share * len(content))] ^= 255
+    path = tmp_path / "a.ckpt"
+    path.write_bytes(content)
+    with pytest.raises(UserError, match=r"a\.ckpt: is damaged: its part '.*' is not what was"):
+        read_checkpoint(path)
+    assert read_checkpoint(shipped)["object_model"]["name"] == "025_mug"

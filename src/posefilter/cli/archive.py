@@ -67,9 +67,25 @@ def check_archive(file: Path, said: str) -> None:
         raise UserError(f"{said}: its parts claim to be larger than the file")
     if len({part.filename.lower() for part in parts}) < len(parts):  # torch's reader sees no case
         raise UserError(f"{said}: two of its parts have one name")
+    _check_whole(file, said)
     for part in parts:
         if part.filename.lower().endswith(".pkl"):
             check_pickle(_read_part(file, part, said), said)
+
+
+def _check_whole(file: Path, said: str) -> None:
+    """Raise UserError where a part is not what was written, by its checksum: torch looks at none,
+    and would load weights that are other numbers.
+    """
+    try:
+        with zipfile.ZipFile(file) as archive:
+            broken = archive.testzip()
+    except (zipfile.BadZipFile, OSError, ValueError, RuntimeError, EOFError) as error:
+        raise UserError(f"{said}: not readable as a checkpoint (it is damaged)") from error
+    if broken is not None:
+        raise UserError(
+            f"{said}: is damaged: its part {broken[:60]!r} is not what was written; copy it again"
+        )
 
 
 def _read_part(file: Path, part: zipfile.ZipInfo, said: str) -> bytes:
