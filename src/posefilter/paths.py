@@ -47,6 +47,15 @@ def stays_inside(path: str, folder: Path) -> bool:
     return any(Path(os.path.realpath(folder / path)).is_relative_to(home) for home in homes)
 
 
+def find_list(file: str, root: Path) -> Path | None:
+    """Return where a list of frames is that a setting names: by its path, or in a dataset's folder
+    or that of the dataset above, with or without `image_sets`; None: nowhere.
+    """
+    inner = (Path(file), Path("image_sets", file))
+    candidates = (Path(file), *(home / one for home in (root, root.parent) for one in inner))
+    return next((path for path in candidates if path.is_file()), None)
+
+
 def check_inside(path: Path, root: Path) -> Path:
     """Return a path below a root as it is.
 

@@ -44,7 +44,7 @@ def assign_estimates(
         data: Their dataset.
     """
     groups = _group(records)
-    by_key = _sort_rows(rows)
+    by_key = sort_rows(rows)
     place = {record.key: i for i, record in enumerate(data.reader.records())}
     out: dict[str, PoseRow] = {}
     for key, own in groups.items():
@@ -86,7 +86,7 @@ def score_targets(
     classes = {record.obj_id for record in data.reader.records()}
     counts = None if targets is None else {one[:3]: one.inst_count for one in targets}
     place = {record.key: i for i, record in enumerate(data.reader.records())}
-    by_key = _sort_rows(rows)
+    by_key = sort_rows(rows)
     judge = _Judge(data)
     scored, used = list[TargetErrors](), 0
     for key in groups if counts is None else counts:
@@ -188,7 +188,7 @@ def _group(records: Sequence[FrameRecord]) -> dict[Key, list[FrameRecord]]:
     return out
 
 
-def _sort_rows(rows: Sequence[PoseRow]) -> dict[Key, list[PoseRow]]:
+def sort_rows(rows: Sequence[PoseRow]) -> dict[Key, list[PoseRow]]:
     """Return the estimates of each class in each image, the most confident first; equally
     confident ones stay in their order.
     """

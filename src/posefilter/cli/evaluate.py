@@ -14,7 +14,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from posefilter.callbacks.errors import ErrorTable, make_rows
 from posefilter.callbacks.records import Records, to_rows, write_beliefs
-from posefilter.cli.bop_scores import assign_estimates, score_targets
+from posefilter.cli.bop_scores import assign_estimates, score_targets, sort_rows
 from posefilter.cli.build import build_data, make_trainer, quiet
 from posefilter.cli.checkpoints import method_of, read_checkpoint
 from posefilter.cli.components import changed, changes, chosen
@@ -34,7 +34,7 @@ from posefilter.errors import UserError
 from posefilter.geometry.boxes import box_of_pose
 from posefilter.metrics.apparent_size import describe_mismatch
 from posefilter.metrics.bop import BopErrors
-from posefilter.metrics.bop_results import PoseRow, read_poses_csv, to_mesh, write_poses_csv
+from posefilter.metrics.bop_results import read_poses_csv, to_mesh, write_poses_csv
 from posefilter.metrics.bop_targets import Target, read_targets
 from posefilter.metrics.collect import BoxIoU, PoseErrors
 from posefilter.metrics.errors import add
@@ -176,9 +176,6 @@ def _of_estimates(job: Job) -> tuple[dict[str, Any], dict[str, Path]]:
     targets = list_targets(job, settings)
     data = build_data(settings, job.cfg.console)
     data.setup("test")
-    best = dict[tuple[int, int, int], PoseRow]()
-    for row in sorted(rows, key=lambda row: -row.score):
-        best.setdefault((row.scene_id, row.im_id, row.obj_id), row)
     assigned = assign_estimates(rows, data.records("test"), data)
     if not assigned:
         raise UserError(
@@ -219,7 +216,8 @@ def _of_estimates(job: Job) -> tuple[dict[str, Any], dict[str, Path]]:
     found = errors.compute()
     other = 1000 * float(np.median(in_mesh_frame))
     warn_of_frame(found["add"]["median_mm"], other, job.cfg.console)
-    seconds = [row.seconds for row in best.values() if row.seconds >= 0]
+    best = (own[0] for own in sort_rows(rows).values())
+    seconds = [row.seconds for row in best if row.seconds >= 0]
     results = found | bop.compute()
     results |= {"iou": float(iou.compute()), "particles_on_object": None}
     results["seconds_per_image"] = sum(seconds) / len(seconds) if seconds else None

@@ -17,7 +17,7 @@ from hydra.errors import (
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 
-from posefilter.cli.choices import config_folders
+from posefilter.cli.choices import config_folders, list_choices
 from posefilter.cli.instantiate import hint
 from posefilter.cli.plain import to_plain
 from posefilter.cli.renamed import rename_argument, rename_missing
@@ -115,11 +115,10 @@ def explain_hydra(error: BaseException, conf: Path, arguments: list[str]) -> str
         return f"{', '.join(chosen) or 'the sweep'}: has failed ({first_line(error)})"
     # a choice that is null or a number, and the like
     groups = [a for a in arguments if (conf / a.partition("=")[0].lstrip("+~")).is_dir()]
-    wrong = [a for a in groups if a.partition("=")[2].lower() in ("true", "false")]
-    for argument in wrong[:1]:
-        group = argument.partition("=")[0].lstrip("+~")
-        known = ", ".join(sorted(file.stem for file in (conf / group).glob("[!_]*.yaml")))
-        return f"{argument}: choose {known}"
+    wrong = next((a for a in groups if a.partition("=")[2].lower() in ("true", "false")), None)
+    if wrong is not None:
+        known = list_choices(conf / wrong.partition("=")[0].lstrip("+~"))
+        return f"{wrong}: choose {', '.join(known)}"
     return f"{', '.join(groups) or 'the settings'}: cannot be read ({first_line(error)})"
 
 

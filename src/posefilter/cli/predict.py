@@ -20,7 +20,7 @@ from posefilter.cli.shapes import load_shape, open_shapes
 from posefilter.confidence.tolerance import PoseTolerance, read_pose_tolerance
 from posefilter.confidence.verdicts import Costs, describe_probability
 from posefilter.data.camera_files import CameraFile, read_camera_file
-from posefilter.data.readers.decode import holds_meters, read_color, read_depth
+from posefilter.data.readers.decode import expect_size, holds_meters, read_color, read_depth
 from posefilter.errors import NotThere, UserError
 from posefilter.estimator import Estimator
 from posefilter.figures.canvas import save_image
@@ -331,13 +331,9 @@ def read_inputs(cfg: DictConfig) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """
     rgb, depth = read_photograph(cfg.rgb, cfg.depth, cfg.depth_scale)
     camera = read_intrinsics(cfg.intrinsics, cfg.distortion is not None)
-    K, (height, width) = camera.K, depth.shape
-    if camera.size not in (None, (height, width)):
-        assert camera.size is not None
-        raise UserError(
-            f"intrinsics={cfg.intrinsics}: are of images of {camera.size[1]}x{camera.size[0]} "
-            f"pixels, but the color image has {width}x{height}"
-        )
+    K = camera.K
+    if camera.size is not None:
+        expect_size(Path(cfg.rgb), rgb, *camera.size, f"intrinsics={cfg.intrinsics}")
     if cfg.distortion is not None:
         before = np.count_nonzero(depth)
         rgb, depth = undistort(rgb, depth, K, parse_distortion(cfg.distortion))

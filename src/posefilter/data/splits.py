@@ -13,6 +13,7 @@ import numpy as np
 from posefilter.data.frames import FrameRecord
 from posefilter.errors import UserError
 from posefilter.limits import read_json, read_lines
+from posefilter.paths import find_list
 
 log = logging.getLogger(__name__)
 
@@ -196,14 +197,7 @@ def _named(records: Sequence[FrameRecord], patterns: list[str], part: str) -> li
 
 def _listed(records: Sequence[FrameRecord], file: str, root: Path) -> list[int]:
     """Return the records that a file lists."""
-    candidates = [
-        Path(file),
-        root / file,
-        root / "image_sets" / file,
-        root.parent / file,
-        root.parent / "image_sets" / file,
-    ]
-    path = next((p for p in candidates if p.is_file()), None)
+    path = find_list(file, root)
     if path is None:
         raise UserError(f"data.split: no such list of frames: {file} (nor below {root})")
     if path.suffix == ".json":

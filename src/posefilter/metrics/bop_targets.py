@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 
 from posefilter.errors import UserError
 from posefilter.limits import read_json
+from posefilter.paths import find_list
 
 _KEYS = ("scene_id", "im_id", "obj_id", "inst_count")
 
@@ -33,8 +34,7 @@ def read_targets(file: str, root: Path) -> tuple[Path, list[Target]]:
     Raises:
         UserError: There is none, or it holds something else; the message names the entry.
     """
-    candidates = (Path(file), root / file, root.parent / file)
-    path = next((one for one in candidates if one.is_file()), None)
+    path = find_list(file, root)
     if path is None:
         raise UserError(f"targets={file}: no such file, nor in data.root={root}")
     content = read_json(path)
