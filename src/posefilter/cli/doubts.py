@@ -8,19 +8,19 @@ from posefilter.cli.console import say
 from posefilter.result import Result
 
 
-def say_doubt(result: Result, image: str, told: set[str], console: str, **facts: Any) -> None:
+def say_doubt(result: Result, image: str, warned: set[str], console: str, **facts: Any) -> None:
     """Warn of a result whose depth or intrinsics must be wrong, or whose image cannot be judged.
 
     Args:
         result: The result.
         image: Which image it is of, as in "frame 000001".
-        told: What was warned of before, which is not said again; objects and reasons are added.
+        warned: Objects and reasons that were warned of before, and are not again; more are added.
         console: Where to.
         facts: More, for machines.
     """
     doubt = result.blank or (result.object if result.wrong_size else "")
-    if doubt and doubt not in told:
-        told.add(doubt)
+    if doubt and doubt not in warned:
+        warned.add(doubt)
         said = f"warning: {image}: {'; '.join(result.warnings)}"
         facts |= {"object": result.object, "warnings": list(result.warnings)}
         say(console, "warning", said, **facts)
