@@ -91,3 +91,27 @@ def test_a_copy_changes_by_itself() -> None:
 def test_keeps_names_and_order_of_parameters() -> None:
     names = ["0.weight", "1.weight", "1.bias", "1.running_mean", "1.running_var"]
     assert [*ConvNorm(5, 16).state_dict()] == [*names, "1.num_batches_tracked"]
+
+
+@pytest.mark.skipif(not has_onednn(), reason="nothing is folded without oneDNN")
+@pytest.mark.parametrize("size", [(8, 10), (15, 20), (6, 6)])
+def test_weights_lie_as_they_are_used(size: tuple[int, int], capfd: pytest.CaptureFixture) -> None:
+    """Bringing these weights into another order takes forty times as long as the convolution."""
+    net = ConvNorm(160, 160).eval()
+    x = torch.randn(1, 160, *size)
+    with torch.no_grad():
+        net(x)
+        with torch.backends.mkldnn.verbose(torch.backends.mkldnn.VERBOSE_ON):
+            net(x)
+    lines = [line for line in capfd.readouterr().out.splitlines() if ",exec," in line]
+    assert any("convolution" in line for line in lines)
+    assert not [line for line in lines if "reorder" in line and "160x160x3x3" in line]
+
+
+def test_sizes_one_after_another() -> None:
+    net = make("skip")
+    for side in [15, 16, 17, 18, 19, 20, 21, 22, 15]:
+        x = image(side, side + 1)
+        exact = reference(net, x)
+        with torch.no_grad():
+            torch.testing.assert_close(net(x), exact, rtol=1e-5, atol=1e-5)

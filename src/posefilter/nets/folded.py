@@ -4,7 +4,7 @@ Outside training batch norm is a factor and a summand for each channel, which be
 convolution's weights. oneDNN adds a skip and takes ReLU while it writes the result. The numbers are
 those of the layers themselves up to rounding. The folded weights are kept in the order that oneDNN
 works in, which it would otherwise bring them into at each call: of a small image that is most of
-the time.
+the time. That order depends on the processor and on the image's size.
 """
 
 import torch
@@ -15,7 +15,15 @@ from posefilter.nets.linear import has_onednn
 
 _LAST = torch.channels_last
 _ONEDNN = has_onednn() and hasattr(torch.ops.mkldnn, "_convolution_pointwise")
+_HALF = _ONEDNN and torch.ops.mkldnn._is_mkldnn_bf16_supported()  # not without AVX-512
+_DTYPES = (torch.float32, torch.bfloat16) if _HALF else (torch.float32,)
 _reorder = getattr(torch._C._nn, "mkldnn_reorder_conv2d_weight", None)
+
+
+def _find_dtype() -> torch.dtype:
+    """Return what a convolution on the CPU computes in: float32, or what autocast says."""
+    half = torch.is_autocast_enabled("cpu")
+    return torch.get_autocast_dtype("cpu") if half else torch.float32
 
 
 class ConvNorm(nn.Sequential):
@@ -54,20 +62,20 @@ class ConvNorm(nn.Sequential):
 
     def folds(self, x: Tensor) -> bool:
         """Return whether the folded convolution applies: without gradient and outside training, on
-        a CPU, float32 or by autocast bfloat16, not traced for export.
+        a CPU, float32 or by autocast bfloat16 where oneDNN has it, not traced for export.
         """
         if torch.is_grad_enabled() or self.training or torch.compiler.is_compiling():
             return False
         weight = self._layers[0].weight
         plain = x.device.type == weight.device.type == "cpu" and x.numel() > 0
         types = weight.dtype == torch.float32 and x.dtype in (torch.float32, torch.bfloat16)
+        works = _ONEDNN and _find_dtype() in _DTYPES
         # nothing tells whether a tensor of inference mode has changed
-        return _ONEDNN and plain and types and not weight.is_inference()
+        return works and plain and types and not weight.is_inference()
 
     def _convolve(self, x: Tensor, skip: Tensor | None) -> Tensor:
-        half = torch.is_autocast_enabled("cpu")
-        dtype = torch.get_autocast_dtype("cpu") if half else torch.float32
-        weight, bias = self._fold(dtype)
+        dtype = _find_dtype()
+        weight, bias = self._fold(dtype, x.shape)
         x = x.to(dtype).contiguous(memory_format=_LAST)
         convolve = torch.ops.mkldnn._convolution_pointwise
         out: Tensor
@@ -78,26 +86,32 @@ class ConvNorm(nn.Sequential):
         out = convolve.binary(x, skip, weight, bias, *self._where, "add", 1.0, "relu", [], "")
         return out
 
-    def _fold(self, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
-        """Return weight and bias with batch norm in them, in the order that oneDNN works in."""
+    def _fold(self, dtype: torch.dtype, shape: torch.Size) -> tuple[Tensor, Tensor]:
+        """Return weight and bias with batch norm in them, in the order that oneDNN works in for an
+        input of that shape.
+        """
         conv, norm = self._layers
         mean, variance, count = norm.running_mean, norm.running_var, norm.num_batches_tracked
         assert mean is not None
         assert variance is not None
         assert count is not None
+        # training updates the statistics without a new version, but it counts its batches
+        parts = (conv.weight, norm.weight, norm.bias, mean, variance, count)
 
         def fold() -> tuple[Tensor, Tensor]:
             gain = norm.weight.detach() * (variance + norm.eps).rsqrt()
             bias = norm.bias.detach() - mean * gain
             weight = (conv.weight.detach() * gain[:, None, None, None]).to(dtype)
-            weight = weight.contiguous(memory_format=_LAST)
+            return weight.contiguous(memory_format=_LAST), bias.to(dtype)
+
+        def order() -> tuple[Tensor, Tensor]:
+            weight, bias = CACHE.get(self, parts, dtype, fold)
             if _reorder is not None:
-                weight = _reorder(weight.to_mkldnn(), *self._where, None)
-            return weight, bias.to(dtype)
+                weight = _reorder(weight.to_mkldnn(), *self._where, list(shape))
+            return weight, bias
 
-        # training updates the statistics without a new version, but it counts its batches
-        parts = (conv.weight, norm.weight, norm.bias, mean, variance, count)
-        return CACHE.get(self, parts, dtype, fold)
+        return CACHE.get(self, parts, (dtype, shape), order)
 
 
-CACHE: ModuleCache[tuple[Tensor, Tensor]] = ModuleCache()
+# a window's size changes with the object's distance: few are kept, since each has all weights
+CACHE: ModuleCache[tuple[Tensor, Tensor]] = ModuleCache(max_entries=6)
