@@ -3,14 +3,15 @@ training, and clutter.
 
     python bench/comparisons.py [--list] [--only PIECE] [--model NAME] [--tiny] [KEY=VALUE ...]
 
-The plan's pieces, the most telling first, train two filters and three comparisons on rendered
+The plan's pieces, the most telling first, train the five methods and three comparisons on rendered
 scenes: with the same number of steps and images a step, or for the same processor time, on growing
 parts of one training set; and test those of 1,000 images on scenes with more and more distractors.
 `--list` prints the commands with what each is to take on one thread. `--only` and `--model` may be
 repeated; `--only tables` runs nothing. Started again, it goes on where it was stopped. What is
 typed beyond the options, such as threads=1, is handed to every command. After each piece the rows
-of docs/results/runs.csv are written, and the tables of docs/results/comparisons.md; with `--tiny`,
-which checks that all pieces run, both are copies in the runs' own folder.
+of docs/results/runs.csv are written, and the tables of docs/results/comparisons.md, where cells of
+what did not run stay; with `--tiny`, which checks that all pieces run, both are copies in the runs'
+own folder.
 """
 
 import argparse
@@ -24,7 +25,7 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from marked import format_row, put_table
+from marked import format_row, put_table, read_rows
 
 from posefilter.metrics.image_errors import FILE, ImageError, read_errors
 from posefilter.metrics.scores import auc, recall
@@ -32,7 +33,10 @@ from posefilter.metrics.scores import auc, recall
 HOME = Path(__file__).parents[1]
 ROOT, TINY_ROOT = Path("outputs/comparisons"), Path("outputs/comparisons_tiny")
 PAGE = HOME / "docs" / "results" / "comparisons.md"
-MODELS = ("dense_coordinates", "rotation_grid", "patch_pf", "keypoints", "pose_pf")
+POSED = ("dense_coordinates", "rotation_grid", "patch_pf", "pixel_pf", "keypoints", "pose_pf")
+DETECTORS = ("cnn_patch", "downsized")
+IN_IMAGE = ("patch_pf", "pixel_pf", *DETECTORS)  # their particles are positions in the image
+MODELS = (*POSED, *DETECTORS)
 SIZES, MOST = (50, 100, 200, 400, 1000), 1000
 VALIDATED, TESTED = 20, 100  # images
 SCENES = (
@@ -79,6 +83,9 @@ COSTS = {
     "patch_pf": Cost(0.17, 0.02),
     "keypoints": Cost(0.21, 0.02),
     "pose_pf": Cost(0.26, 0.07),
+    "pixel_pf": Cost(0.17, 0.02),
+    "cnn_patch": Cost(0.25, 0.03),
+    "downsized": Cost(0.23, 0.03),
 }
 METRICS = 0.1  # [s] of an image
 START = 12.0  # [s] of processor time of a run without its steps and images
@@ -220,6 +227,11 @@ def measure_recall(rows: Sequence[ImageError]) -> float:
     return recall(errors, 0.1 * diameters)
 
 
+def measure_on_object(rows: Sequence[ImageError]) -> float:
+    """Return the share of the last particles that lie on the object [%]."""
+    return 100 * float(np.mean([row.particles_on_object for row in rows]))
+
+
 def bootstrap(
     runs: Sequence[Sequence[ImageError]], measure: Callable[[Sequence[ImageError]], float]
 ) -> str:
@@ -243,20 +255,21 @@ def tabulate(
     tests: Sequence[Tested],
     columns: Sequence[int],
     measure: Callable[[Sequence[ImageError]], float],
+    models: Sequence[str] = POSED,
 ) -> Table:
     """Return a row a method and a column a setting; a dash where there is no test."""
     found: dict[tuple[str, int], list[list[ImageError]]] = {}
     for test in tests:
         found.setdefault((test.model, test.at), []).append(test.rows)
     cells = {key: bootstrap(runs, measure) for key, runs in found.items()}
-    rows = [format_row([f"`{m}`", *[cells.get((m, at), "–") for at in columns]]) for m in MODELS]
+    rows = [format_row([f"`{m}`", *[cells.get((m, at), "–") for at in columns]]) for m in models]
     return ["", *[f"{at:,}" for at in columns]], rows
 
 
 def tabulate_visibility(tests: Sequence[Tested], at: int) -> Table:
     """Return a row a method, of the tests at one setting, and a column a range of visibility."""
     rows, counts = [], [0] * len(VISIBLE)
-    for model in MODELS:
+    for model in POSED:
         runs = [test.rows for test in tests if (test.model, test.at) == (model, at)]
         cells = []
         for column, (low, high) in enumerate(VISIBLE):
@@ -279,6 +292,7 @@ def write_tables(root: Path, page: Path) -> None:
     tables = {
         "auc": tabulate(steps, SIZES, measure_auc),
         "recall": tabulate(steps, SIZES, measure_recall),
+        "on_object": tabulate(steps, SIZES, measure_on_object, IN_IMAGE),
         "auc_in_time": tabulate(time, SIZES, measure_auc),
         "recall_in_time": tabulate(time, SIZES, measure_recall),
         "visibility": tabulate_visibility(steps, MOST),
@@ -288,8 +302,20 @@ def write_tables(root: Path, page: Path) -> None:
     }
     text = page.read_text()
     for title, (head, rows) in tables.items():
-        text = put_table(text, title, head, rows)
+        if any("[" in row for row in rows):
+            text = put_table(text, title, head, keep_cells(rows, read_rows(text, title)))
     page.write_text(text)
+
+
+def keep_cells(rows: Sequence[str], old: Sequence[str]) -> list[str]:
+    """Return a table's rows with the old cells of the same method where the new ones are dashes."""
+    split = lambda row: row.strip("| ").split(" | ")  # noqa: E731
+    known = {split(row)[0]: split(row) for row in old}
+    kept = []
+    for row in map(split, rows):
+        before = known.get(row[0], row)
+        kept.append(format_row([b if a == "–" else a for a, b in zip(row, before, strict=True)]))
+    return kept
 
 
 def write_results(tiny: bool) -> int:

@@ -83,3 +83,27 @@ def test_tables_have_a_dash_where_nothing_was_run(bench: ModuleType) -> None:
     assert "| `keypoints` | 0.0 [0, 0] | – | 100.0 [100, 100] |" in seen
     images = ["0.3 to 0.5 (4 images)", "0.5 to 0.8 (0 images)", "0.8 to 1 (4 images)"]
     assert head == ["", *images]
+
+
+def test_cells_of_what_was_not_run_stay(bench: ModuleType) -> None:
+    old = ["| `keypoints` | 1.0 [0, 3] | – |", "| `pose_pf` | 2.0 [1, 3] (3) | 5.0 [4, 6] |"]
+    tests = [bench.Tested("keypoints", 1000, 0, rows([0.0] * 8))]
+    _, table = bench.tabulate(tests, [50, 1000], bench.measure_recall, ["keypoints", "pixel_pf"])
+    kept = bench.keep_cells([*table, "| `pose_pf` | – | – |"], old)
+    assert kept == [
+        "| `keypoints` | 1.0 [0, 3] | 100.0 [100, 100] |",
+        "| `pixel_pf` | – | – |",
+        "| `pose_pf` | 2.0 [1, 3] (3) | 5.0 [4, 6] |",
+    ]
+
+
+def test_detectors_are_judged_by_where_their_particles_lie(bench: ModuleType) -> None:
+    seen = [
+        row._replace(particles_on_object=share)
+        for share, row in zip([0.5, 0.7], rows([0, 0]), strict=True)
+    ]
+    tests = [bench.Tested("downsized", 50, seed, seen) for seed in range(2)]
+    _, table = bench.tabulate(tests, [50], bench.measure_on_object, bench.DETECTORS)
+    assert table == ["| `cnn_patch` | – |", "| `downsized` | 60.0 [50, 70] (2) |"]
+    _, posed = bench.tabulate(tests, [50], bench.measure_auc)
+    assert not any("downsized" in row for row in posed)
