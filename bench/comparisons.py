@@ -76,7 +76,8 @@ class Cost(NamedTuple):
     image: float  # of a test
 
 
-# of 5 steps of 8 images and a test of 8, without metrics, on one thread
+# of 5 steps of 8 images and a test of 8, without metrics, on one thread; of the last three from
+# their ratio to patch_pf on another machine
 COSTS = {
     "dense_coordinates": Cost(0.16, 0.02),
     "rotation_grid": Cost(0.15, 0.70),
