@@ -11,12 +11,11 @@ import torch
 from torch import Tensor, nn
 
 from posefilter.nets.cache import ModuleCache
-from posefilter.nets.linear import has_onednn
+from posefilter.nets.linear import list_onednn_types
 
 _LAST = torch.channels_last
-_ONEDNN = has_onednn() and hasattr(torch.ops.mkldnn, "_convolution_pointwise")
-_HALF = _ONEDNN and torch.ops.mkldnn._is_mkldnn_bf16_supported()  # not without AVX-512
-_DTYPES = (torch.float32, torch.bfloat16) if _HALF else (torch.float32,)
+_FUSES = hasattr(torch.ops.mkldnn, "_convolution_pointwise")
+_TYPES = list_onednn_types() if _FUSES else ()
 _reorder = getattr(torch._C._nn, "mkldnn_reorder_conv2d_weight", None)
 
 
@@ -69,9 +68,8 @@ class ConvNorm(nn.Sequential):
         weight = self._layers[0].weight
         plain = x.device.type == weight.device.type == "cpu" and x.numel() > 0
         types = weight.dtype == torch.float32 and x.dtype in (torch.float32, torch.bfloat16)
-        works = _ONEDNN and _find_dtype() in _DTYPES
         # nothing tells whether a tensor of inference mode has changed
-        return works and plain and types and not weight.is_inference()
+        return _find_dtype() in _TYPES and plain and types and not weight.is_inference()
 
     def _convolve(self, x: Tensor, skip: Tensor | None) -> Tensor:
         dtype = _find_dtype()

@@ -23,7 +23,7 @@ from posefilter.geometry.pose import origin_of, rotation_of
 from posefilter.nets.cache import ModuleCache
 from posefilter.nets.coordinates import STRIDE, Context
 from posefilter.nets.layers import ResnetFC
-from posefilter.nets.linear import has_onednn
+from posefilter.nets.linear import list_onednn_types
 
 if TYPE_CHECKING:
     from posefilter.nets.likelihood import Pixels, PoseLikelihood
@@ -366,12 +366,12 @@ def _linear_relu(x: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
     """relu(x W^T + b), in one operation where oneDNN or cuBLAS has it.  (m, k), (n, k), (n,) -> (m,
     n).
     """
-    if _FUSES and x.device.type == "cpu":
+    if x.dtype in _TYPES and x.device.type == "cpu":
         out: Tensor = torch.ops.mkldnn._linear_pointwise(x, weight, bias, "relu", [], "")
         return out
     return torch._addmm_activation(bias, x, weight.t())
 
 
-_FUSES = has_onednn()
+_TYPES = list_onednn_types()
 CACHE: ModuleCache[_Weights] = ModuleCache()
 RECORDINGS: ModuleCache[cuda_graphs.Recording] = ModuleCache()

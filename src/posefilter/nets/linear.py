@@ -13,6 +13,14 @@ def has_onednn() -> bool:
     return torch.backends.mkldnn.is_available() and hasattr(torch.ops.mkldnn, "_linear_pointwise")
 
 
+def list_onednn_types() -> tuple[torch.dtype, ...]:
+    """Return the types that oneDNN computes in on this processor: bfloat16 needs AVX-512."""
+    if not has_onednn():
+        return ()
+    half = torch.ops.mkldnn._is_mkldnn_bf16_supported()
+    return (torch.float32, torch.bfloat16) if half else (torch.float32,)
+
+
 _ONEDNN = has_onednn()
 
 
