@@ -12,10 +12,12 @@ from posefilter.confidence.calibration import Assessment
 from posefilter.confidence.verdicts import Costs
 from posefilter.errors import UserError
 from posefilter.estimator import count_instances
+from posefilter.filters.resample import AdaptiveResampling, NoResampling, Systematic
 from posefilter.geometry.camera import back_project
 from posefilter.geometry.pose import make_pose
-from posefilter.instances.detect import Detection, _is_open, detect, resolve
+from posefilter.instances.detect import Detection, _begin, _is_open, detect, resolve
 from posefilter.models.base import PoseEstimator
+from posefilter.protocols import Resample
 from posefilter.types import Batch, BeliefBatch, ObjectModel, Trace
 
 H, W, SIDE = 48, 64, 6  # [px]
@@ -53,6 +55,7 @@ class SimpleFilter:
 
     particles = initial_particles = 8
     zoom_diameter = None
+    resample: Resample = Systematic()
 
     def __call__(self, batch: Batch, method: Any, generator: Generator) -> Any:
         seen = method.encode(batch)[0] * (batch.depth[0, 0] > 0)
@@ -232,3 +235,18 @@ def test_an_answer_that_is_absent_after_all_takes_no_place() -> None:
     assert not _is_open(job, [found, make_detection(20, 29, 0.99)], Costs())
     job.searches = 3
     assert not _is_open(job, [found, absent], Costs())
+
+
+@pytest.mark.parametrize(
+    ("resample", "particles"),
+    [(Systematic(), 80), (AdaptiveResampling(Systematic()), 80), (NoResampling(), 320)],
+)
+def test_a_smaller_filter_without_resampling_keeps_as_many_as_it_begins_with(
+    resample: Resample, particles: int
+) -> None:
+    toy = Toy(0)
+    toy.filter.particles = toy.filter.initial_particles = 500
+    toy.filter.resample = resample
+    small = _begin(0, cast(PoseEstimator, toy), draw(THREE), 2).filter
+    assert (small.particles, small.initial_particles) == (particles, 320)
+    assert toy.filter.particles == 500

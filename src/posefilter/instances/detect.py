@@ -14,6 +14,7 @@ from posefilter.confidence.second_look import measure_worth
 from posefilter.confidence.verdicts import Costs, Verdict, decide
 from posefilter.confidence.visible_pixels import blank, find_visible
 from posefilter.filters.loop import ParticleFilter
+from posefilter.filters.resample import NoResampling
 from posefilter.instances.pixels import keep_pixels, resize_mask
 from posefilter.models.base import PoseEstimator
 from posefilter.models.zoom import search
@@ -113,6 +114,8 @@ def _begin(number: int, method: PoseEstimator, batch: Batch, count: int) -> _Job
     small = copy.copy(method.filter)
     small.particles = min(small.particles, _PARTICLES)
     small.initial_particles = min(small.initial_particles, _INITIAL_PARTICLES)
+    if isinstance(small.resample, NoResampling):  # it keeps as many as it begins with
+        small.particles = small.initial_particles
     return _Job(number, method, batch, count, small, method.generator("predict", 0))
 
 
