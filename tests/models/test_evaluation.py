@@ -42,6 +42,18 @@ def test_an_estimate_that_is_no_number_is_a_miss() -> None:
         assert metrics[name] == metrics[name]
 
 
+def test_the_time_of_an_image_is_the_mean_over_images_and_not_over_batches(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    method, clock = build(Own).eval(), iter([0.0, 3.0, 3.0, 6.0])
+    monkeypatch.setattr("posefilter.models.base.time", SimpleNamespace(perf_counter=clock.__next__))
+    with torch.no_grad():
+        method.validation_step(scenes(3), 0)  # a second an image
+        method.validation_step(scenes(1), 1)  # three
+    assert method.seconds_per_image == [1, 1, 1, 3]
+    assert method.compute_metrics()["seconds_per_image"] == 1.5
+
+
 class Peeks(Own):
     """Its images are the mask and the place of the truth."""
 

@@ -104,7 +104,7 @@ class PoseEstimator(Module):
         self._object_model: ObjectModel | None = None
         self._first: tuple[nn.Module, ...] = ()  # the first module that has weights
         self._scores: Any = None  # made when they are first asked for
-        self.seconds_per_image: list[float] = []
+        self.seconds_per_image: list[float] = []  # one number for each image
         self.last_belief: BeliefBatch | None = None  # of the batch that the metrics took in last
         self.skipped_steps = self.skipped_in_a_row = 0  # whose gradient was not finite
         self.time_spent = 0.0  # share of the training's time budget, where it has one
@@ -439,7 +439,8 @@ class PoseEstimator(Module):
         start = time.perf_counter()
         trace = self._run(batch, self.generator(stage, batch_number))
         trace.belief.best.cpu()  # waits for a GPU
-        self.seconds_per_image.append((time.perf_counter() - start) / len(batch.rgb))
+        seconds = (time.perf_counter() - start) / len(batch.rgb)
+        self.seconds_per_image += [seconds] * len(batch.rgb)
         self.update_metrics(trace, batch)
         return trace
 
