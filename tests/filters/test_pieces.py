@@ -186,6 +186,19 @@ def test_pixels_agree_in_the_image_or_on_a_pose() -> None:
     assert (POSES.distance(vote.best, output.pose[:, 0]) < 0.01).all()
 
 
+def test_poses_are_compared_as_predicted_where_a_state_holds_less() -> None:
+    """As of `RotationGrid`, whose states have rotations that mean nothing."""
+    particles, output = two_clusters()
+    noise = torch.zeros(2, 4, 6)
+    noise[..., 3:] = torch.randn(2, 4, 3, generator=Generator().manual_seed(2))
+    unread = particles._replace(state=POSES.move(particles.state, noise))
+    known, found = (
+        DensestMode(0.01)(one, output, None, Poses(), Generator()) for one in (particles, unread)
+    )
+    assert torch.equal(found.best, known.best)
+    assert torch.equal(found.score, known.score)
+
+
 @pytest.mark.parametrize("chunk", [1 << 20, 20])
 def test_kernel_mass_is_a_double_loop(chunk: int) -> None:
     g = Generator().manual_seed(0)

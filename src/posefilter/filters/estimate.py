@@ -122,9 +122,11 @@ def kernel_mass(
 class DensestMode(BestParticle):
     """The pose of the particle of highest kernel density; the score is the log of its kernel mass.
 
+    Particles of a space of poses are compared by the poses that they predict, since a method need
+    not read all of a state.
+
     Args:
-        bandwidth: Of the Gaussian kernel over the particles' states, in the space's unit ([m] or
-            [px]).
+        bandwidth: Of the Gaussian kernel over the particles, in the space's unit ([m] or [px]).
     """
 
     score_is: ClassVar[str] = _KERNEL_MASS
@@ -134,8 +136,9 @@ class DensestMode(BestParticle):
 
     def rate(self, particles: Particles, output: ParticleOutput, method: Method) -> Tensor:
         """Return the logs of their kernel masses."""
-        state, log_weights = particles.state.detach(), particles.log_weights.detach()
-        return kernel_mass(state, log_weights, method.space, self.bandwidth)
+        posed = isinstance(method.space, PoseSpace)
+        where = (output.pose if posed else particles.state).detach()
+        return kernel_mass(where, particles.log_weights.detach(), method.space, self.bandwidth)
 
 
 class DensestPose(BestParticle):
