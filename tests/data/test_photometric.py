@@ -21,6 +21,7 @@ from posefilter.data.photometric import (
     vignette,
 )
 from posefilter.errors import UserError
+from posefilter.synthetic.sensor import motion_kernel
 
 OFF = [
     ColorResponse(hue_deg=0, mixing=0, tint=0, gamma=0),
@@ -188,6 +189,17 @@ def test_motion_blur_keeps_a_constant_image_and_smooths_another() -> None:
             <= 1
         )
     assert apply(MotionBlur(0.2, probability=1), sample()).rgb.std() < 0.9 * sample().rgb.std()
+
+
+@pytest.mark.parametrize("length", [2, 3, 4, 5, 6, 8])
+def test_motion_blur_is_as_long_as_asked_for_and_leaves_the_image_in_its_place(length: int) -> None:
+    """A color that moved against depth and mask would be wrong by as much as it moved."""
+    for seed in range(20):
+        kernel = motion_kernel(np.random.default_rng(seed), length)
+        at = np.mgrid[: len(kernel), : len(kernel)] - (len(kernel) - 1) / 2
+        assert np.abs((kernel * at).sum((1, 2))).max() < 0.05
+        along = np.linalg.eigvalsh(np.einsum("yx,iyx,jyx->ij", kernel, at, at))[1]
+        assert 0.7 * length < np.sqrt(12 * along) < 1.5 * length  # of an even line
 
 
 def test_a_jpeg_of_high_quality_is_closer_than_one_of_low() -> None:

@@ -108,11 +108,18 @@ def _vary_brightness(rgb: np.ndarray, rng: np.random.Generator) -> np.ndarray:
 
 
 def motion_kernel(rng: np.random.Generator, length: int) -> np.ndarray:
-    """Return the kernel of motion blur: a line of `length` pixels in a random direction."""
-    line = np.zeros((length, length), np.float32)
-    line[length // 2] = 1
-    turn = cv2.getRotationMatrix2D((length / 2 - 0.5, length / 2 - 0.5), rng.uniform(0, 180), 1)
-    kernel = cv2.warpAffine(line, turn, (length, length))
+    """Return the kernel of motion blur: a line of `length` pixels in a random direction.
+
+    It is about its middle pixel, so that the image stays in its place.
+    """
+    middle = length // 2
+    side = 2 * middle + 1
+    line = np.zeros((side, side), np.float32)
+    line[middle] = 1
+    if length < side:
+        line[middle, [0, -1]] = 0.5
+    turn = cv2.getRotationMatrix2D((middle, middle), rng.uniform(0, 180), 1)
+    kernel = cv2.warpAffine(line, turn, (side, side))
     return kernel / max(float(kernel.sum()), 1e-6)
 
 
