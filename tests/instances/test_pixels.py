@@ -126,3 +126,9 @@ def test_masks_keep_their_place_at_another_size() -> None:
     large = resize_mask(mask, (24, 32))
     assert torch.equal(large, mask.repeat_interleave(2, 0).repeat_interleave(2, 1))
     assert torch.equal(resize_mask(large, (12, 16)), mask)
+
+
+def test_a_smaller_mask_stays_in_its_place() -> None:
+    middle = torch.zeros(9, 9, dtype=torch.bool)
+    middle[4, 4] = True
+    assert resize_mask(middle, (3, 3)).nonzero().tolist() == [[1, 1]]

@@ -34,4 +34,5 @@ def resize_mask(mask: Tensor, size: tuple[int, int]) -> Tensor:
     """Return a mask (H, W) bool at another size, by the nearest pixel."""
     if (mask.shape[0], mask.shape[1]) == size:
         return mask
-    return F.interpolate(mask[None, None].float(), size, mode="nearest")[0, 0] > 0
+    # "nearest" alone takes the pixel before, so that masks shift
+    return F.interpolate(mask[None, None].float(), size, mode="nearest-exact")[0, 0] > 0
