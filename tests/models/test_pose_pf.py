@@ -234,6 +234,20 @@ def test_labeled_rays_and_a_start_from_proposals_refuse_another_method() -> None
         method.set_object(method.object_model)
 
 
+def test_the_logged_error_of_the_coordinates_is_of_images_that_show_the_object(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    method, batch, logged = working().train(), scenes(2), list[float]()
+    monkeypatch.setattr(method, "log_scalar", lambda name, value: logged.append(float(value)))
+    only = torch.tensor([True, False])
+    # the network sees the same images, whatever their masks are
+    for seen in (only, ~only, only | True, only & False):
+        own = batch._replace(mask=batch.mask & seen[:, None, None, None])
+        method.training_losses(own, torch.Generator().manual_seed(0))
+    assert len(logged) == 3
+    assert logged[2] == pytest.approx((logged[0] + logged[1]) / 2, rel=1e-4)
+
+
 def test_candidates_hold_the_truth_whatever_the_camera() -> None:
     method = working()
     batch = scenes(2)

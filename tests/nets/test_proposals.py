@@ -156,6 +156,15 @@ def test_the_loss_is_least_for_the_truth() -> None:
     assert right < unsure
 
 
+def test_an_image_without_the_object_has_no_error_and_teaches_its_absence() -> None:
+    said, cells, pose = world()
+    none = torch.zeros_like(said.logit)[:, None].repeat_interleave(STRIDE, 2)
+    none = none.repeat_interleave(STRIDE, 3) > 0
+    loss, error = coordinate_loss(said, cells, none, pose, CENTER, RADIUS, 0.3)
+    assert error.isnan().all()
+    assert loss.isfinite().all()
+
+
 def test_fragments_spread_over_the_surface() -> None:
     points = torch.randn(500, 3, generator=torch.Generator().manual_seed(0))
     points = points / points.norm(dim=-1, keepdim=True)

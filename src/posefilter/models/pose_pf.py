@@ -183,7 +183,9 @@ class PosePF(PoseParticles):
                 encoding.coordinates, encoding.cells, batch.mask, batch.camera_from_object, *size
             )
             losses["proposals"] = self.proposal_weight * fit
-            self.log_scalar("coordinate_error_mm", 1000 * error.mean())
+            known = error[error.isfinite()]
+            if len(known):
+                self.log_scalar("coordinate_error_mm", 1000 * known.mean())
         return losses
 
     def set_object(self, object_model: ObjectModel) -> None:

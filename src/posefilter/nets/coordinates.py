@@ -106,7 +106,8 @@ def coordinate_loss(
         mean_radius: The fragments' mean radius, in radii of the object.
 
     Returns:
-        The loss of each image (B,), and the mean error of the most probable points (B,) [m].
+        The loss of each image (B,), and the mean error of the most probable points (B,) [m], NaN of
+        an image in which no cell shows the object with its depth.
     """
     truth, on, usable = true_coordinates(cells, mask, camera_from_object, center, radius)
     inside = usable.float()
@@ -119,7 +120,8 @@ def coordinate_loss(
         coordinates.log_prob, coordinates.position, coordinates.centers, mean_radius, truth
     )
     distance = (coordinates.coordinate - truth).norm(dim=-1).detach() * radius
-    return 5 * bce + mean(nll + 0.3 * error), mean(distance)
+    seen = usable.flatten(1).any(1)
+    return 5 * bce + mean(nll + 0.3 * error), torch.where(seen, mean(distance), torch.nan)
 
 
 class HasCoordinates(Protocol):
