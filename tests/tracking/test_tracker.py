@@ -18,10 +18,11 @@ from posefilter.filters.refine import Compose
 from posefilter.filters.texture import TextureRotations
 from posefilter.geometry.rotation import random_rotation
 from posefilter.tracking.motion import ConstantVelocity
+from posefilter.tracking.objectness import measure_objectness
 from posefilter.tracking.rotate import RotateTogether
 from posefilter.tracking.settings import FilterSettings, TrackerSettings
 from posefilter.tracking.track_loss import TrackLossDetector
-from posefilter.types import BeliefBatch
+from posefilter.types import Batch, BeliefBatch
 
 NONE = np.zeros_like(DEPTH)
 BLACK = np.zeros_like(RGB)
@@ -159,6 +160,27 @@ def test_a_loss_is_noticed_where_the_network_takes_other_pixels_for_the_object()
     assert any(one.is_tracked for one in results[12:15])
     assert results[-1].presence > 0.9
     assert off(results[-1], pose) < 0.008
+
+
+@pytest.mark.parametrize(("rows", "found"), [(23, 0.0), (18, 1.0)])
+def test_an_image_that_is_no_whole_cells_is_read_cell_by_cell(rows: int, found: float) -> None:
+    """Of 180 rows in cells of 8, those from 168 to 175 are the last but one's; in 18 cells of 10,
+    the last two's.
+    """
+    objectness = torch.zeros(1, 1, rows, 40 if rows == 23 else 32)
+    objectness[:, :, -1] = 1
+    if rows == 18:
+        objectness[:, :, -2] = 1
+    rgb = torch.zeros(1, 3, 180, 320)
+    camera = torch.tensor([[[100.0, 0, 160], [0, 100, 172], [0, 0, 1]]])
+    none = torch.zeros(1, dtype=torch.int64)
+    batch = Batch(
+        rgb, rgb[:, :1], rgb[:, :1] > 0, camera, torch.eye(4)[None], none, none, torch.ones(1)
+    )
+    points = torch.tensor([[0.0, -0.03, 0], [0, 0.03, 0]])  # rows 169 and 175
+    pose = torch.eye(4)
+    pose[2, 3] = 1
+    assert measure_objectness(objectness, batch, pose, points) == found
 
 
 def test_a_track_has_no_conformal_sets() -> None:

@@ -42,6 +42,11 @@ def measure_objectness(objectness: Tensor, batch: Batch, pose: Tensor, points: T
     inside = ((pixels > -0.5) & (pixels < size - 0.5)).all(1)
     if not bool(inside.any()):
         return 0.0
+    h, w = objectness.shape[-2:]
+    # cells of whole pixels, the last of which may reach beyond the image
+    side = max(-(-height // h), -(-width // w))
+    if (-(-height // side), -(-width // side)) == (h, w):
+        height, width = h * side, w * side
     found = gather_objectness(objectness, pixels[inside][None], height, width)
     return float(torch.mean(found))
 
