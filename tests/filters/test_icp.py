@@ -163,6 +163,17 @@ def pixels_of(points: Tensor) -> Tensor:
     return nearest_pixel(project(points[None], K[None]))
 
 
+def test_an_image_of_another_camera_beside_it_changes_nothing() -> None:
+    g, seen = Generator().manual_seed(3), look(CORNER)
+    rough = seen.measured_depth + 0.001 * torch.randn(seen.measured_depth.shape, generator=g)
+    both = Seen(rough.repeat(2, 1, 1), torch.stack([K, torch.diag(torch.tensor([4.0, 4, 1])) @ K]))
+    pixels = torch.tensor([[[W // 2, H // 2]]]).repeat(2, 1, 1)
+    together = look_up(both.measured_depth, both.intrinsics, pixels)
+    for row in range(2):
+        alone = look_up(*(x[row : row + 1] for x in (*both, pixels)))
+        assert torch.equal(together.normals[row], alone.normals[0])
+
+
 def test_normals_of_a_slope_and_none_at_edges() -> None:
     normal = torch.nn.functional.normalize(torch.tensor([0.3, -0.2, -1.0]), dim=0)
     view = rays(pixel_grid(H, W).reshape(-1, 2), K)

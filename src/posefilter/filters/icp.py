@@ -168,9 +168,9 @@ def look_up(depth: Tensor, K: Tensor, pixels: Tensor) -> Surface:
     Returns:
         The surface (B, P).
     """
-    step = max(1, round(_STEP * float(K[:, 0, 0].mean())))
-    sides = pixels.new_tensor([[0, 0], [1, 0], [-1, 0], [0, 1], [0, -1]]) * step
-    around = pixels[:, :, None] + sides
+    step = (_STEP * K[:, 0, 0]).round().clamp_min(1).to(pixels)[:, None, None]
+    sides = pixels.new_tensor([[0, 0], [1, 0], [-1, 0], [0, 1], [0, -1]]) * step  # of each image
+    around = pixels[:, :, None] + sides[:, None]
     z = gather_pixels(depth[:, None], around.flatten(1, 2)).view(around.shape[:-1])
     at = back_project(around.flatten(1, 2).to(z), z.flatten(1), K).view(*z.shape, 3)
     middle, right, left, below, above = at.unbind(2)
