@@ -158,8 +158,27 @@ def test_an_evaluation_renders_nothing_unless_asked(tmp_path: Path) -> None:
     assert not (tmp_path / "mistyped").exists()
     small = ["++data.generate.frames=1", "++data.generate.size=[96,72]"]
     job = compose_job("evaluate", CONF, [*typed, *small, "++data.object=carton"], tmp_path)
-    build_data(data_settings(job, {}, None), "json")
+    build_data(data_settings(job, {}, None), "json", job.overrides)
     assert (tmp_path / "mistyped" / "mixed").is_dir()
+
+
+def test_scenes_that_were_rendered_otherwise_than_is_typed_are_refused(tmp_path: Path) -> None:
+    root = tmp_path / "scenes"
+    small = ["data.generate.frames=1", "data.generate.size=[96,72]", "data.generate.workers=1"]
+
+    def build(*more: str) -> None:
+        typed = [f"data.root={root}", "data.progress=false", *more]
+        job = compose_job("train", CONF, typed, tmp_path)
+        build_data(job.cfg.data, "json", job.overrides)
+
+    build(*small, "data.generate.max_occlusion=0.2")
+    build(*small, "data.generate.max_occlusion=0.2", "data.generate.workers=2")
+    build()  # what is not typed is the dataset's
+    with pytest.raises(UserError) as refused:
+        build("data.generate.max_occlusion=0.5", "data.generate.frames=2", "data.generate.seed=0")
+    assert str(refused.value).startswith(
+        f"data.generate.frames=2, max_occlusion=0.5: the scenes in {root} were rendered with "
+    )
 
 
 def test_a_mesh_scale_reaches_the_meshes(tmp_path: Path) -> None:

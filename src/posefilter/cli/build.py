@@ -2,6 +2,8 @@
 
 import logging
 import warnings
+from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -25,8 +27,18 @@ from posefilter.errors import UserError
 log = logging.getLogger(__name__)
 
 
-def build_data(node: DictConfig, console: str) -> PoseDataModule:
-    """Build the data module, and have its scenes rendered where they are missing."""
+def build_data(node: DictConfig, console: str, overrides: Sequence[str] = ()) -> PoseDataModule:
+    """Build the data module, and have its scenes rendered where they are missing.
+
+    Args:
+        node: The settings of the data.
+        console: "rich" or "json".
+        overrides: What was typed.
+
+    Raises:
+        UserError: A setting is wrong, or the scenes that are there were rendered otherwise than is
+            typed.
+    """
     if console == JSON:
         node = without_bars(node)
     if node.get("generate") and "_target_" not in node.generate:
@@ -36,7 +48,30 @@ def build_data(node: DictConfig, console: str) -> PoseDataModule:
     if not isinstance(data, PoseDataModule):
         raise UserError(f"data._target_={node.get('_target_')}: is no data module")
     data.prepare_data()
+    if node.get("generate"):
+        settings = {k: v for k, v in resolve(node.generate).items() if not k.startswith("_")}
+        _check_rendered(data.root, settings, overrides)
     return data
+
+
+def _check_rendered(root: Path, settings: Mapping[str, Any], overrides: Sequence[str]) -> None:
+    """Refuse scenes that are there and were rendered otherwise than is typed: they are not rendered
+    anew.
+    """
+    keys = {one.lstrip("+").partition("=")[0] for one in overrides}
+    typed = {name for name in settings if f"data.generate.{name}" in keys}
+    if not typed:
+        return
+    from posefilter.synthetic.generate import list_changed  # renderers: other data need none
+
+    changed = [
+        f"{name}={settings[name]}" for name in list_changed(root, **settings) if name in typed
+    ]
+    if changed:
+        raise UserError(
+            f"data.generate.{', '.join(changed)}: the scenes in {root} were rendered with another "
+            "value, and are not rendered anew; name a folder of their own, data.root=DIR"
+        )
 
 
 def without_bars(node: DictConfig) -> DictConfig:

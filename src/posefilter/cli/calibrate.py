@@ -83,7 +83,7 @@ def calibrate(job: Job) -> None:
     method.to(choose_device()).seed = cfg.seed
     settings = data_settings(job, checkpoint["recipe"]["settings"], name, "val")
     settings.limit_val = cfg.frames
-    data = build_data(settings, cfg.console)
+    data = build_data(settings, cfg.console, job.overrides)
     data.setup("validate")
     without = cfg.frames if cfg.absent_frames is None else cfg.absent_frames
     absent = [data.absent_dataset("val", without)]

@@ -96,7 +96,7 @@ def _of_checkpoint(job: Job) -> tuple[dict[str, Any], dict[str, Path]]:
         method.calibration.fit_success(method.pose_tolerance)  # refused before anything is tested
     check_links(job.folder)
     settings = data_settings(job, checkpoint["recipe"]["settings"], method.object_model.name)
-    data = build_data(settings, job.cfg.console)
+    data = build_data(settings, job.cfg.console, job.overrides)
     data.setup("test")
     method.set_object(object_to_judge(data, method.object_model))
     warn_of_several(data, job.cfg.console)
@@ -174,7 +174,7 @@ def _of_estimates(job: Job) -> tuple[dict[str, Any], dict[str, Path]]:
     rows = read_poses_csv(Path(str(job.cfg.estimates)))
     settings = data_settings(job, {}, None)
     targets = list_targets(job, settings)
-    data = build_data(settings, job.cfg.console)
+    data = build_data(settings, job.cfg.console, job.overrides)
     data.setup("test")
     assigned = assign_estimates(rows, data.records("test"), data)
     if not assigned:

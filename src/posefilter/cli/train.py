@@ -78,7 +78,7 @@ def build(job: Job) -> Run:
     settle(job.cfg.threads, job.cfg.seed)
     # first, since they are the sooner to complain
     method, trainer = build_method(recipe(job)), build_trainer(job)
-    data = build_data(job.cfg.data, job.cfg.console)
+    data = build_data(job.cfg.data, job.cfg.console, job.overrides)
     data.setup("fit")
     object_model = data.object_to_learn()
     method.set_object(object_model)

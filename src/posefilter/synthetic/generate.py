@@ -4,15 +4,16 @@ The result does not depend on the number of processes, and an interrupted run ca
 """
 
 import importlib.metadata
+import inspect
 import json
 import logging
 import shutil
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from hashlib import sha256
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -56,6 +57,14 @@ _RENAMED = {
     "absent_share": "absent_fraction",
     "covered_frames": "fully_occluded_frames",
 }
+
+
+class _Record(NamedTuple):
+    """How a dataset was begun."""
+
+    settings: dict[str, Any]
+    frames: int
+    mesh: str | None  # digest of the object's mesh
 
 
 @dataclass(frozen=True)
@@ -146,39 +155,9 @@ def generate(
     Raises:
         UserError: A value or mesh is wrong, or `out` was begun with other settings.
     """
-    numbers = {name: value for name, value in locals().items() if name != "camera"}
-    check_ranges(numbers, "generate")
-    out = Path(out)
-    scenes = SceneSettings(
-        distractors=(int(distractors[0]), int(distractors[1])),
-        max_occlusion=float(max_occlusion),
-        occluded_fraction=float(occluded_fraction),
-        tabletop_fraction=float(tabletop_fraction),
-        settle=bool(settle),
-        absent_fraction=float(absent_fraction),
-        instances=int(instances),
-        lookalike_texture=str(lookalike_texture),
-    )
-    if frames_per_scene is None:  # what suits still or moving scenes
-        frames_per_scene = 2 if moving == "none" else 30
-    width, height = (int(n) for n in size)
-    K = camera_matrix(camera, width, height)
-    rows = tuple(tuple(float(x) for x in row) for row in K)
-    job = Job(
-        object,
-        str(meshes),
-        int(seed),
-        width,
-        height,
-        rows,
-        stereo,
-        sensor,
-        int(frames_per_scene),
-        renderer,
-        scenes,
-        1.0 if mesh_scale is None else float(mesh_scale),
-        MotionSettings(moving, float(moving_mm), float(moving_deg), int(fully_occluded_frames)),
-    )
+    given = dict(locals())
+    check_ranges({name: value for name, value in given.items() if name != "camera"}, "generate")
+    out, job = Path(out), _make_job(given)
     _check(job)
     store = MeshStore(meshes, scale=job.mesh_scale)
     todo = [i for i in range(frames) if not all(path.is_file() for path in job.files(out, i))]
@@ -197,6 +176,65 @@ def generate(
             release(out)
     folders = len({job.folder(i) for i in range(frames)})
     return Summary(out, frames, len(todo), folders, time.perf_counter() - began)
+
+
+def list_changed(out: Path, **settings: Any) -> list[str]:
+    """Return the settings, as they are typed, with which a dataset that is there was not rendered.
+
+    Args:
+        out: The dataset's folder.
+        **settings: Those of `generate`; one that is left out has its default.
+
+    Returns:
+        Their names; none where no dataset of this generator is there.
+
+    Raises:
+        UserError: Its record is damaged.
+    """
+    record = _read_record(out)
+    if record is None:
+        return []
+    bound = inspect.signature(generate).bind(out, **settings)
+    bound.apply_defaults()
+    names = _list_differing(record.settings, _describe(_make_job(bound.arguments)))
+    return _as_typed([*names, *(["frames"] if record.frames != settings["frames"] else [])])
+
+
+def _make_job(given: Mapping[str, Any]) -> Job:
+    """Return what is rendered for the arguments of `generate`, by name."""
+    low, high = given["distractors"]
+    scenes = SceneSettings(
+        distractors=(int(low), int(high)),
+        max_occlusion=float(given["max_occlusion"]),
+        occluded_fraction=float(given["occluded_fraction"]),
+        tabletop_fraction=float(given["tabletop_fraction"]),
+        settle=bool(given["settle"]),
+        absent_fraction=float(given["absent_fraction"]),
+        instances=int(given["instances"]),
+        lookalike_texture=str(given["lookalike_texture"]),
+    )
+    moving, frames_per_scene = given["moving"], given["frames_per_scene"]
+    if frames_per_scene is None:  # what suits still or moving scenes
+        frames_per_scene = 2 if moving == "none" else 30
+    width, height = (int(n) for n in given["size"])
+    K = camera_matrix(given["camera"], width, height)
+    rows = tuple(tuple(float(x) for x in row) for row in K)
+    shift, turn = float(given["moving_mm"]), float(given["moving_deg"])
+    return Job(
+        given["object"],
+        str(given["meshes"]),
+        int(given["seed"]),
+        width,
+        height,
+        rows,
+        given["stereo"],
+        given["sensor"],
+        int(frames_per_scene),
+        given["renderer"],
+        scenes,
+        1.0 if given["mesh_scale"] is None else float(given["mesh_scale"]),
+        MotionSettings(moving, shift, turn, int(given["fully_occluded_frames"])),
+    )
 
 
 def camera_matrix(camera: str | Sequence[float], width: int, height: int) -> np.ndarray:
@@ -303,18 +341,10 @@ def _open_dataset(out: Path, job: Job, frames: int, mesh: str | None) -> None:
         frames: How many frames it is to hold.
         mesh: Digest of the object's mesh; None where nothing is left to render.
     """
-    settings = json.loads(json.dumps({"version": VERSION, **asdict(job)}))
-    path = out / GENERATOR
-    if path.is_file():
-        try:
-            record = json.loads(path.read_bytes())
-            there, before = _with_defaults(record["settings"]), int(record["frames"])
-            known = record.get("mesh")
-        except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
-            raise UserError(
-                f"{path}: not a generator's record any more ({error}); choose another out="
-            ) from error
-        differing = _list_differing(there, settings)
+    settings = _describe(job)
+    path, record = out / GENERATOR, _read_record(out)
+    if record is not None:
+        differing = _list_differing(record.settings, settings)
         if not any(out.glob("mixed/*/[0-9]*.json")):
             # an earlier start failed before its first frame: nothing is kept of it
             for folder in out.glob("mixed/scene*_0"):
@@ -324,13 +354,13 @@ def _open_dataset(out: Path, job: Job, frames: int, mesh: str | None) -> None:
             raise UserError(
                 f"{path}: this dataset was begun with other settings ({keys}); choose another out="
             )
-        elif mesh and known not in (None, mesh):
+        elif mesh and record.mesh not in (None, mesh):
             raise UserError(
                 f"{path}: this dataset was begun with another mesh of {job.object}, whose file was "
                 "changed since; choose another out="
             )
         else:
-            frames, mesh = max(frames, before), mesh or known
+            frames, mesh = max(frames, record.frames), mesh or record.mesh
         remove_parts(out, [".", "mixed/*"])
     elif out.is_dir() and any(path.name != LOCK for path in out.iterdir()):
         raise UserError(
@@ -340,8 +370,33 @@ def _open_dataset(out: Path, job: Job, frames: int, mesh: str | None) -> None:
     out.mkdir(parents=True, exist_ok=True)
     packages = ("posefilter", "numpy", "embreex", "opencv-python-headless")
     versions = {name: _find_version(name) for name in packages}
-    record = {"settings": settings, "frames": frames, "mesh": mesh, "versions": versions}
-    fat.write_json(path, record)
+    content = {"settings": settings, "frames": frames, "mesh": mesh, "versions": versions}
+    fat.write_json(path, content)
+
+
+def _describe(job: Job) -> dict[str, Any]:
+    """Return the settings of what is rendered, as a record has them."""
+    described: dict[str, Any] = json.loads(json.dumps({"version": VERSION, **asdict(job)}))
+    return described
+
+
+def _read_record(out: Path) -> _Record | None:
+    """Return what a dataset's folder says of how it was begun, None where none was.
+
+    Raises:
+        UserError: The record is damaged.
+    """
+    path = out / GENERATOR
+    if not path.is_file():
+        return None
+    try:
+        content = json.loads(path.read_bytes())
+        settings, frames = _with_defaults(content["settings"]), int(content["frames"])
+        return _Record(settings, frames, content.get("mesh"))
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+        raise UserError(
+            f"{path}: not a generator's record any more ({error}); choose another out="
+        ) from error
 
 
 def _find_version(package: str) -> str | None:
