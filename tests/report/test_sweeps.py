@@ -4,6 +4,7 @@ import json
 import shutil
 import subprocess
 import sys
+from itertools import product
 from pathlib import Path
 
 import pytest
@@ -12,7 +13,7 @@ from posefilter.errors import UserError
 from posefilter.metrics.image_errors import FILE, ImageError, write_errors
 from posefilter.metrics.registry import find_metric
 from posefilter.report.gather import read_run
-from posefilter.report.sweep_charts import chart_over
+from posefilter.report.sweep_charts import chart_over, name_axis
 from posefilter.report.sweep_page import (
     format_mean,
     format_spread,
@@ -20,6 +21,8 @@ from posefilter.report.sweep_page import (
     make_sweep_page,
 )
 from posefilter.report.sweeps import (
+    Job,
+    Sweep,
     find_best_group,
     find_best_job,
     find_ties,
@@ -61,6 +64,25 @@ def test_panels_hold_means_and_ranges(sweep: Path) -> None:
     assert chart_over("refine", found, group_jobs(found), [find_metric("add/auc")])[
         0
     ].categories == ["none", "gradient"]
+
+
+def test_charts_name_the_settings_that_they_take_the_mean_over(tmp_path: Path) -> None:
+    axes = ["steps", "loss", "model", "seed"]
+    places = list(product((5, 10), ("bce", "focal"), ("a", "b"), (0, 1)))
+    jobs = [
+        Job(dict(zip(axes, place, strict=True)), {"add/auc": float(i)}, str(i))
+        for i, place in enumerate(places)
+    ]
+    found = Sweep(tmp_path, axes, jobs, [])
+    (panel,) = chart_over("steps", found, group_jobs(found), [find_metric("add/auc")])
+    assert [line.label for line in panel.lines] == ["loss=bce", "loss=focal"]
+    assert list(panel.lines[0].y) == [1.5, 9.5]  # of both models and seeds
+    assert panel.xlabel == "steps (mean over model)"
+    assert "model (mean over loss)" in make_sweep_page(found, None, None, "").render()
+    two = Sweep(
+        tmp_path, ["steps", "loss", "seed"], [job for job in jobs if job.place["model"] == "a"], []
+    )
+    assert name_axis("steps", two) == "steps"
 
 
 def test_cells() -> None:
@@ -206,5 +228,7 @@ def test_a_run_that_was_evaluated_since_keeps_its_row(sweep: Path) -> None:
     shutil.copy2(own / "metrics.json", own / "metrics_train.json")
     others = {"add": {"auc": 1.0}, "overrides": ["checkpoint=a.ckpt", "data=ycb_video"]}
     (own / "metrics.json").write_text(json.dumps(others))
+    (own / "evaluation_1").mkdir()
+    shutil.copy2(own / "metrics.json", own / "evaluation_1")
     after = read_sweep(sweep)
     assert (after.axes, after.jobs) == (before.axes, before.jobs)

@@ -39,11 +39,11 @@ def draw_summary(sweep: Sweep) -> Figure | None:
     title = f"Sweep over {', '.join(sweep.shown)}: {count}\n{notes}"
     figure.suptitle(title, fontsize=12, fontweight="bold")
     axes = figure.subplots(len(rows), columns, squeeze=False, height_ratios=heights)
-    for axis, line, row in zip(charts, axes, rows, strict=True):
+    for line, row in zip(axes, rows, strict=True):
         for own, panel in zip(line, row, strict=True):
             draw_panel(own, panel, LIGHT)
         if row[0].categories:
-            line[0].set_ylabel(axis, fontsize=8.5)
+            line[0].set_ylabel(row[0].xlabel, fontsize=8.5)
         if len(row[0].lines) > 1:
             line[0].legend(fontsize=8, frameon=False)
     return figure

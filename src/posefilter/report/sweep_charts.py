@@ -24,8 +24,7 @@ def chart_over(
         return []
     numeric = not any(isinstance(value, str) for value in values)
     spots = {value: float(value) if numeric else float(i) for i, value in enumerate(values)}
-    few = (one for one in sweep.shown if one != axis and 1 < len(sweep.values(one)) <= MOST_LINES)
-    other = next(few, None)
+    other = choose_lines(axis, sweep)
     kinds = [None] if other is None else [(other, value) for value in sweep.values(other)]
     low = min(spots.values())
     log_x = numeric and low > 0 and max(spots.values()) / low >= 8
@@ -37,7 +36,7 @@ def chart_over(
             out.append(
                 Panel(
                     info.label,
-                    axis,
+                    name_axis(axis, sweep),
                     info.unit,
                     shown,
                     info.limits,
@@ -47,6 +46,21 @@ def chart_over(
                 )
             )
     return out
+
+
+def choose_lines(axis: str, sweep: Sweep) -> str | None:
+    """Return the axis whose values become the lines of another's charts; None where none has few
+    values.
+    """
+    few = (one for one in sweep.shown if one != axis and 1 < len(sweep.values(one)) <= MOST_LINES)
+    return next(few, None)
+
+
+def name_axis(axis: str, sweep: Sweep) -> str:
+    """Return an axis as its charts are headed: with the others that they take the mean over."""
+    lines = choose_lines(axis, sweep)
+    rest = [x for x in sweep.shown if x not in (axis, lines) and len(sweep.values(x)) > 1]
+    return f"{axis} (mean over {', '.join(rest)})" if rest else axis
 
 
 def line_over(

@@ -20,7 +20,7 @@ from posefilter.report.images import group_by_section
 from posefilter.report.page import Page
 from posefilter.report.run_page import list_settings, make_tiles, show_worst_and_best
 from posefilter.report.settings import Change
-from posefilter.report.sweep_charts import chart_against_time, chart_over, spell
+from posefilter.report.sweep_charts import chart_against_time, chart_over, name_axis, spell
 from posefilter.report.sweeps import (
     COLUMNS,
     Group,
@@ -49,7 +49,7 @@ def make_sweep_page(
     plots: list[Block] = []
     for axis in sweep.shown:
         charts = draw_charts(chart_over(axis, sweep, found, infos))
-        plots += [Heading(axis), *note_seeds(found), *charts] if charts else []
+        plots += [Heading(name_axis(axis, sweep)), *note_seeds(found), *charts] if charts else []
     winner = find_best_job(sweep)
     sections = [
         Section("Table", tabulate_groups(sweep, found, infos)),
