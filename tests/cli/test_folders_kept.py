@@ -8,7 +8,7 @@ from omegaconf import OmegaConf
 
 from posefilter.cli import run_command
 from posefilter.cli.evaluate import keep_training_results
-from posefilter.cli.folders import KeepResults
+from posefilter.cli.folders import KeepResults, move_evaluation
 from posefilter.errors import UserError
 
 HOME = Path(__file__).parents[2]
@@ -58,6 +58,24 @@ def test_what_a_run_found_is_set_aside_before_its_first_evaluation(tmp_path: Pat
     keep_training_results(run)
     assert json.loads((run / "metrics_train.json").read_text()) == {"iou": 0.5}
     assert (run / "errors_train.csv").read_text() == "of the run"
+
+
+def test_an_evaluation_stays_where_its_run_goes_on(tmp_path: Path) -> None:
+    run = fill(tmp_path / "run", iou=0.5)
+    (run / "errors.csv").write_text("of the run")
+    assert move_evaluation(run) is None
+    before = contents(run)
+    for number in (1, 2):
+        keep_training_results(run)
+        found = {"metrics.json": json.dumps({"command": "evaluate", "iou": number})}
+        found |= dict.fromkeys(("errors.csv", "poses.csv"), f"of evaluation {number}")
+        for name, text in found.items():
+            (run / name).write_text(text)
+        place = run / f"evaluation_{number}"
+        assert move_evaluation(run) == place
+        assert contents(place) == found
+        shown = contents(run)
+        assert {name: text for name, text in shown.items() if "evaluation" not in name} == before
 
 
 @pytest.mark.parametrize("command", ["train", "predict"])

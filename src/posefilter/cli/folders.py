@@ -3,6 +3,7 @@
 import json
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -120,8 +121,31 @@ def deciding(overrides: list[str]) -> list[str]:
     return sorted(typed for typed in overrides if typed.split("=", 1)[0].lstrip("+~") not in HANDS)
 
 
-# of a run's own test, after an evaluation of the same folder
-OWN_RESULTS = ("metrics_train.json", "errors_train.csv")
+# what an evaluation writes, the file by which it is known last; and where what a run's own test has
+# found is then
+_EVALUATION = ("errors.csv", "poses.csv", "beliefs.npz", "metrics.json")
+_OWN_RESULTS = {"metrics_train.json": "metrics.json", "errors_train.csv": "errors.csv"}
+
+
+def move_evaluation(folder: Path) -> Path | None:
+    """Move an evaluation out of the way of a run that goes on in its folder, into a folder in it;
+    what the run's own test had found takes its place again.
+
+    Returns:
+        Where the evaluation is now; None where there is none.
+    """
+    if not holds_evaluation(folder):
+        return None
+    places = (folder / f"evaluation_{number}" for number in count(1))
+    place = next(one for one in places if not one.exists())
+    place.mkdir()
+    for name in _EVALUATION:
+        if (folder / name).is_file():
+            (folder / name).replace(place / name)
+    for own, name in _OWN_RESULTS.items():
+        if (folder / own).is_file():
+            (folder / own).replace(folder / name)
+    return place
 
 
 def own_metrics(folder: Path) -> dict[str, Any]:

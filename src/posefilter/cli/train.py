@@ -18,7 +18,7 @@ from posefilter.cli.best import check_kept
 from posefilter.cli.build import build_data, build_trainer
 from posefilter.cli.checkpoints import build_method, method_of, read_checkpoint, recipe
 from posefilter.cli.console import is_installed, say, typed
-from posefilter.cli.folders import OWN_RESULTS
+from posefilter.cli.folders import move_evaluation
 from posefilter.cli.job import Job
 from posefilter.cli.learned import DATA, list_learned
 from posefilter.cli.machine import settle
@@ -141,6 +141,10 @@ def fit(run: Run) -> dict[str, Any]:
     check_kept(run.trainer.callbacks, run.job.folder)  # type: ignore[attr-defined]
     check_validated(run)
     start, before = start_from(run.job)
+    moved = None if is_follower() else move_evaluation(run.job.folder)
+    if moved is not None:
+        sentence = f"the evaluation that was here, of an earlier checkpoint, is now in {moved}"
+        say(run.job.cfg.console, "moved", sentence, evaluation=moved)
     began = time.perf_counter(), time.process_time()
     try:
         with stopped_by_interrupt():
@@ -241,8 +245,6 @@ def finish(
     if is_follower():
         return metrics
     write_json(file, metrics)
-    for earlier in OWN_RESULTS:  # of the run's own test, which an evaluation had moved there
-        (job.folder / earlier).unlink(missing_ok=True)
     report = typed("report", run=job.folder)
     evaluate = typed("evaluate", checkpoint=tested, **places(job), **plugins(job))
     inside = Path("outputs").resolve() in job.folder.resolve().parents
