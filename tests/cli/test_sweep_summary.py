@@ -8,8 +8,10 @@ from pathlib import Path
 
 import pytest
 from matplotlib.figure import Figure
+from omegaconf import OmegaConf
 
-from posefilter.cli.sweeps import list_rows, summarize
+from posefilter.cli.sweeps import SweepSummary, list_rows, summarize
+from posefilter.errors import Carrier
 from posefilter.metrics.registry import PERCENT
 from posefilter.report.summary import draw_summary
 from posefilter.report.sweeps import Job, Sweep, read_sweep
@@ -53,6 +55,29 @@ def test_ablations_are_in_the_order_of_the_table(tmp_path: Path) -> None:
     assert [text.get_text() for text in panel.get_yticklabels()] == ablations
     assert panel.yaxis_inverted(), "from the top"
     assert panel.lines[0].get_xdata() == pytest.approx([10 * place for place in range(5)])  # [%]
+
+
+def test_a_sweep_fails_by_its_own_jobs_alone(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """What an earlier start in the folder has left is listed, and no failure of this one."""
+    bad, good = tmp_path / "seed=x", tmp_path / "seed=1"
+    for job in (bad, good):
+        job.mkdir()
+    note = json.dumps({"overrides": ["seed=x"], "error": "no number"})
+    (bad / "failed.json").write_text(note)
+    config = OmegaConf.create({"console": "json", "hydra": {"sweep": {"dir": str(tmp_path)}}})
+    summary = SweepSummary()
+    summary.on_multirun_start(config)
+    (good / "metrics.json").write_text(json.dumps({"overrides": ["seed=1"], "iou": 0.5}))
+    summary.on_multirun_end(config)
+    assert json.loads(capsys.readouterr().out)["failed"] == []
+    assert "no number" in (tmp_path / "summary.md").read_text()
+
+    (bad / "failed.json").write_text(note)  # again
+    with pytest.raises(Carrier, match="1 of 2 jobs failed"):
+        summary.on_multirun_end(config)
+    assert json.loads(capsys.readouterr().out)["failed"] == ["seed=x"]
 
 
 def test_numbers_are_read_by_size(tmp_path: Path) -> None:

@@ -24,16 +24,24 @@ Row = dict[str, Any]
 class SweepSummary(Callback):
     """Hydra's callback: sums up a sweep's folder."""
 
+    def __init__(self) -> None:
+        self._before: dict[Path, int] = {}  # notes of failures, and when they were written
+
+    def on_multirun_start(self, config: DictConfig, **kwargs: Any) -> None:
+        """Take note of the failures that an earlier start has left in the folder."""
+        self._before = _list_failures(Path(config.hydra.sweep.dir))
+
     def on_job_end(self, config: DictConfig, job_return: JobReturn, **kwargs: Any) -> None:
         """Bring the summary up to date: a sweep that is cut short has one too."""
         if "id" in config.hydra.job and str(config.hydra.mode).endswith("MULTIRUN"):
             summarize(Path(config.hydra.sweep.dir))
 
     def on_multirun_end(self, config: DictConfig, **kwargs: Any) -> None:
-        """Show the summary and say where it is; the command fails where a job has."""
+        """Show the summary and say where it is; the command fails where one of its own jobs has."""
         folder = Path(config.hydra.sweep.dir)
         rows = summarize(folder)
-        failed = [row["folder"] for row in rows if row.get("error")]
+        now = {note.parent for note, _ in _list_failures(folder).items() - self._before.items()}
+        failed = [row["folder"] for row in rows if folder / row["folder"] in now]
         if rows:
             names = ("summary.csv", "summary.md", "summary.png")
             files = {name: folder / name for name in names if (folder / name).is_file()}
@@ -45,6 +53,11 @@ class SweepSummary(Callback):
             raise Carrier(
                 UserError(f"{len(failed)} of {len(rows)} jobs failed: see {folder}/summary.md")
             )
+
+
+def _list_failures(folder: Path) -> dict[Path, int]:
+    """Return the notes of failed jobs below a sweep's folder, and when each was written [ns]."""
+    return {note: note.stat().st_mtime_ns for note in folder.rglob(FAILED)}
 
 
 def summarize(folder: Path) -> list[Row]:
