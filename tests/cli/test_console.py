@@ -3,6 +3,7 @@ as they stand.
 """
 
 import json
+import math
 import shlex
 from pathlib import Path
 from types import SimpleNamespace
@@ -56,7 +57,10 @@ def test_a_long_training_prints_its_progress(
     now = [0.0]
     monkeypatch.setattr("posefilter.cli.progress_bar.time.perf_counter", lambda: now[0])
     trainer: Any = SimpleNamespace(
-        global_step=0, max_steps=40, callback_metrics=METRICS, sanity_checking=False
+        global_step=0,
+        estimated_stepping_batches=40,
+        callback_metrics=METRICS,
+        sanity_checking=False,
     )
     lines, module = Lines(pause=60), SimpleNamespace()
     lines.on_train_start(trainer, module)  # type: ignore[arg-type]
@@ -89,7 +93,10 @@ def test_a_long_test_prints_its_progress(
 def test_a_validation_is_one_line(console: str, capsys: pytest.CaptureFixture[str]) -> None:
     """Words for people, numbers for machines; parts of the images are in the log alone."""
     trainer: Any = SimpleNamespace(
-        global_step=10, max_steps=40, callback_metrics=METRICS, sanity_checking=False
+        global_step=10,
+        estimated_stepping_batches=40,
+        callback_metrics=METRICS,
+        sanity_checking=False,
     )
     lines, module = Lines(console), SimpleNamespace()
     lines.on_train_start(trainer, module)  # type: ignore[arg-type]
@@ -105,6 +112,25 @@ def test_a_validation_is_one_line(console: str, capsys: pytest.CaptureFixture[st
         assert said["step"] == 20
         assert said["val/add/auc"] == 71.0
         assert not any("by_visibility" in name for name in said)
+
+
+@pytest.mark.parametrize(
+    ("max_steps", "expected", "told"), [(-1, 40, "step 20 of 40: "), (-1, math.inf, "step 20: ")]
+)
+def test_a_training_by_epochs_or_by_the_clock_has_no_steps_below_zero(
+    max_steps: int, expected: float, told: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    trainer: Any = SimpleNamespace(
+        global_step=20,
+        max_steps=max_steps,
+        estimated_stepping_batches=expected,
+        callback_metrics=METRICS,
+        sanity_checking=False,
+    )
+    lines, module = Lines(), SimpleNamespace()
+    lines.on_train_start(trainer, module)  # type: ignore[arg-type]
+    lines.on_validation_end(trainer, module)  # type: ignore[arg-type]
+    assert capsys.readouterr().out.startswith(told)
 
 
 def test_the_end_says_where_and_what_next(capsys: pytest.CaptureFixture[str]) -> None:

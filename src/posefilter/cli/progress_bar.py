@@ -1,5 +1,6 @@
 """What is seen on the console while a method trains or is tested."""
 
+import math
 import sys
 import time
 from typing import Any
@@ -39,6 +40,14 @@ def briefly(metrics: dict[str, Any]) -> str:
     return format_metrics({k: metrics[k] for k in ("train/loss", finds) if k in metrics})
 
 
+def count_steps(trainer: Trainer) -> int | None:
+    """Return how many steps a training has, by its epochs too; None where only the clock ends
+    it.
+    """
+    steps = trainer.estimated_stepping_batches
+    return int(steps) if math.isfinite(steps) else None
+
+
 class Lines(Callback):
     """A line at each validation; in a training or a test a sign of life every `pause` seconds: how
     far, how long still.
@@ -47,11 +56,12 @@ class Lines(Callback):
     def __init__(self, console: str = "rich", pause: float = 60.0) -> None:
         self.console, self.pause = console, pause
         self._began, self._step, self._last = 0.0, 0, 0.0
+        self._steps: int | None = None
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Start the clock."""
         self._began, self._step = time.perf_counter(), trainer.global_step
-        self._last = self._began
+        self._last, self._steps = self._began, count_steps(trainer)
 
     def on_train_batch_end(self, trainer: Trainer, pl_module: LightningModule, *_: Any) -> None:
         """Print a line where nothing was said for long."""
@@ -79,18 +89,19 @@ class Lines(Callback):
         say(self.console, "testing", sentence, batch=done, batches=batches)
 
     def _tell(self, event: str, trainer: Trainer, seen: dict[str, Any]) -> None:
-        step, steps, self._last = trainer.global_step, trainer.max_steps, time.perf_counter()
+        step, steps, self._last = trainer.global_step, self._steps, time.perf_counter()
         rate = (step - self._step) / max(self._last - self._began, 1e-9)
         pace = f"{rate:.2f} steps/s"
-        if rate > 0 and steps > step:
+        if rate > 0 and steps is not None and steps > step:
             pace += f", {format_duration((steps - step) / rate)} left"
         words = ", ".join(part for part in (format_metrics(seen), pace) if part)
-        numbers: dict[str, float] = {"step": step, "steps": steps}
+        numbers: dict[str, float | None] = {"step": step, "steps": steps}
         for name, value in seen.items():
             if name == "train/loss" or (name.startswith("val/") and "/by_" not in name):
                 numbers[name] = float(value)
         numbers["steps_per_second"] = rate
-        say(self.console, event, f"step {step} of {steps}: {words}", **numbers)
+        place = f"step {step}" if steps is None else f"step {step} of {steps}"
+        say(self.console, event, f"{place}: {words}", **numbers)
 
 
 class Bars(Callback):
@@ -106,7 +117,7 @@ class Bars(Callback):
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Open the bar."""
         self._training = self._shown().add_task(
-            "training", total=trainer.max_steps, completed=trainer.global_step, said=""
+            "training", total=count_steps(trainer), completed=trainer.global_step, said=""
         )
 
     def on_train_batch_end(self, trainer: Trainer, pl_module: LightningModule, *_: Any) -> None:
