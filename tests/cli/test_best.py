@@ -110,15 +110,20 @@ def test_a_copy_of_a_run_does_not_replace_the_best_of_the_other(tmp_path: Path) 
         ({"save_top_k": 3}, "callbacks.best.save_top_k=3: must be 1"),
         ({"save_top_k": 0}, "callbacks.best.save_top_k=0: must be 1"),
         ({"monitor": "None"}, "callbacks.best.monitor=None: must be .*val/score"),
+        ({"monitor": "val/add/median_mm"}, "mode=max: would keep the worst .*median_mm; .* min"),
+        ({"mode": "min"}, "callbacks.best.mode=min: would keep the worst val/score; must be max"),
     ],
 )
 def test_a_run_whose_best_checkpoint_would_not_be_found_is_refused_before_it(
     wrong: dict[str, Any], told: str, tmp_path: Path
 ) -> None:
     folder = tmp_path / "checkpoints"
-    right = {"dirpath": folder, "filename": "best", "monitor": "val/score"}
+    right = {"dirpath": folder, "filename": "best", "monitor": "val/score", "mode": "max"}
     last = Last(str(folder))
     check_kept([last, Best(**right)], tmp_path)
+    least = {"monitor": "val/add/median_mm", "mode": "min"}
+    check_kept([last, Best(**(right | least))], tmp_path)
+    check_kept([last, Best(**(right | {"monitor": "val/of_a_plugin"}))], tmp_path)
     with pytest.raises(UserError, match=told):
         check_kept([last, Best(**(right | wrong))], tmp_path)
     with pytest.raises(UserError, match=r"callbacks\.best: is missing"):

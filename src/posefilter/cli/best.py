@@ -14,6 +14,7 @@ from torch import Tensor
 from posefilter.cli.resume import BEFORE, LAST
 from posefilter.cli.stopping import any_process, asked_to_stop
 from posefilter.errors import UserError
+from posefilter.metrics.registry import HIGHER, LOWER, find_metric
 
 _KEPT = {"filename": "best", "save_top_k": 1}  # as the test and later commands expect them
 _NONE_DONE = {"ready": 0, "started": 0, "processed": 0, "completed": 0}
@@ -175,3 +176,20 @@ def check_kept(callbacks: Sequence[Callback], folder: Path) -> None:
                 f"callbacks.best.monitor={one.monitor}: must be a number of the validation, such "
                 "as val/score"
             )
+        better = _find_mode(str(one.monitor))
+        if better not in (None, one.mode):
+            raise UserError(
+                f"callbacks.best.mode={one.mode}: would keep the worst {one.monitor}; must be "
+                f"{better}"
+            )
+
+
+def _find_mode(monitor: str) -> str | None:
+    """Return which way a number of the validation is better, "max" or "min"; None where that is not
+    known, as of a plug-in's.
+    """
+    try:
+        direction = find_metric(monitor).direction
+    except UserError:
+        return None
+    return {HIGHER: "max", LOWER: "min"}.get(direction)
