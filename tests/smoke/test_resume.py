@@ -275,6 +275,18 @@ def test_a_folder_whose_name_is_typed_in_quotes_is_resumed(tmp_path: Path) -> No
     assert arguments[-1] == f"out={folder}"
 
 
+def test_what_a_run_had_added_is_taken_away_when_it_is_resumed(tmp_path: Path) -> None:
+    (tmp_path / ".hydra").mkdir()
+    begun = ["+callbacks.early={patience: 1}", "+trainer.max_time=00:01:00:00", "seed=3"]
+    (tmp_path / ".hydra" / "overrides.yaml").write_text(json.dumps(begun))
+    (tmp_path / "checkpoints").mkdir()
+    (tmp_path / "checkpoints" / "last.ckpt").touch()
+    typed = [f"resume={tmp_path}", "~callbacks.early", "~trainer.max_time", "~callbacks.layout"]
+    assert with_resumed(typed) == [
+        *("seed=3", f"resume={tmp_path}", "~callbacks.layout", f"out={tmp_path}"),
+    ]
+
+
 def test_a_job_of_a_chosen_sweep_is_resumed_by_itself(tmp_path: Path) -> None:
     job = tmp_path / "ablation=paper,sweep=ablation"
     (job / ".hydra").mkdir(parents=True)

@@ -75,6 +75,9 @@ def with_resumed(arguments: list[str]) -> list[str]:
     named = {a.split("=", 1)[0].lstrip("+~") for a in arguments}
     before = [update(one, "train") for one in overrides_of(folder)]
     kept = [one for one in before if _key(one) not in named and _key(one) not in _DROPPED]
+    added = {_key(one) for one in before if one.startswith("+")}
+    # `~key` of what the run had added: it is left out, and nothing is there to be deleted
+    arguments = [a for a in arguments if not (a.startswith("~") and _key(a) in added)]
     for override in kept:
         check_override(override, folder)
     # a choice of `sweep` brings the jobs' settings, and would start them all
