@@ -210,6 +210,7 @@ MISTAKES = {
     "filter.particles=0": ("filter.particles=0: must be a whole number, at least 1",),
     "optimizer.lr=fast": ("optimizer.lr=fast: must be a number",),
     "+filter.foo=1": ("filter.foo", "no such setting"),
+    "+experiment=memorize": ("+experiment=memorize: a choice", "type experiment=memorize"),
     "seed=x": ("seed=x", "whole number"),
     "console=loud": ("console=loud", "json"),
     "resume=nowhere": ("resume=nowhere", "not a run's folder"),

@@ -77,6 +77,10 @@ def explain(error: BaseException, name: str, conf: Path, arguments: list[str]) -
             if new is not None:
                 return f"{key}: is now {section}.{new}"
             return f"{key}: there is no such setting{near(key, known_keys(cfg, key))}"
+        if found := re.match(r"Multiple values for (\S+)\. ", text):
+            added = [a for a in arguments if re.match(rf"\+{re.escape(found[1])}=", a)]
+            if added:  # else a file's list of defaults lacks `override`, as Hydra says
+                return f"{added[0]}: a choice of {found[1]} is made already; type {added[0][1:]}"
     if isinstance(error, OverrideParseException):
         return (
             f"{error.override}: cannot be read ({first_line(error)}){_tell_quotes(error.override)}"
