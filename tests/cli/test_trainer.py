@@ -1,5 +1,6 @@
 """What a trainer may be told."""
 
+import warnings
 from pathlib import Path
 
 import pytest
@@ -7,7 +8,7 @@ import torch
 from omegaconf import OmegaConf
 
 from posefilter.cli import run_command
-from posefilter.cli.build import make_trainer
+from posefilter.cli.build import make_trainer, quiet
 from posefilter.errors import UserError
 
 HOME = Path(__file__).parents[2]
@@ -32,6 +33,18 @@ def test_the_device_is_chosen_as_everywhere(monkeypatch: pytest.MonkeyPatch) -> 
     monkeypatch.setattr("torch.backends.mps.is_available", lambda: True)
     trainer = make_trainer(OmegaConf.create({**SETTINGS, "accelerator": "auto"}), [])
     assert trainer.strategy.root_device.type == "cpu"
+
+
+def test_advice_on_several_processes_that_does_not_apply_is_silent() -> None:
+    """Each validates all images: there is nothing to be added up."""
+    with warnings.catch_warnings(record=True) as said:
+        quiet()
+        warnings.warn(  # as Lightning does for each number
+            "It is recommended to use `self.log('val/iou', ..., sync_dist=True)` when logging on "
+            "epoch level in distributed setting to accumulate the metric across devices.",
+            stacklevel=1,
+        )
+    assert said == []
 
 
 @pytest.mark.slow

@@ -171,6 +171,7 @@ def quiet() -> None:
         ".*LeafSpec.*",
         ".*Checkpoint directory.*",
         ".*log_every_n_steps.*",
+        ".*sync_dist=True.*",  # each process validates all images
     ):
         warnings.filterwarnings("ignore", text)
     torch.set_float32_matmul_precision("highest")  # TF32 would cost a pose at 1 m half a millimeter
