@@ -8,7 +8,7 @@ from omegaconf import OmegaConf
 
 from posefilter.cli import run_command
 from posefilter.cli.evaluate import keep_training_results
-from posefilter.cli.folders import KeepResults, move_evaluation
+from posefilter.cli.folders import KeepResults, move_evaluation, own_metrics
 from posefilter.errors import UserError
 
 HOME = Path(__file__).parents[2]
@@ -58,6 +58,18 @@ def test_what_a_run_found_is_set_aside_before_its_first_evaluation(tmp_path: Pat
     keep_training_results(run)
     assert json.loads((run / "metrics_train.json").read_text()) == {"iou": 0.5}
     assert (run / "errors_train.csv").read_text() == "of the run"
+
+
+def test_an_evaluation_of_an_unfinished_run_is_not_its_result(tmp_path: Path) -> None:
+    """It was cut short, and its sweep is to go on with it."""
+    run = fill(tmp_path / "run", command="evaluate", iou=0.1)
+    assert own_metrics(run) == {}
+    (run / "metrics_train.json").write_text('{"iou": 0.5}')
+    assert own_metrics(run) == {"iou": 0.5}
+    job = tmp_path / "job"  # of a sweep of evaluations
+    job.mkdir()
+    (job / "metrics.json").write_text('{"command": "evaluate", "iou": 0.1}')
+    assert own_metrics(job)["iou"] == 0.1
 
 
 def test_an_evaluation_stays_where_its_run_goes_on(tmp_path: Path) -> None:

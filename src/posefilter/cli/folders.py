@@ -154,7 +154,9 @@ def own_metrics(folder: Path) -> dict[str, Any]:
     """
     for name in ("metrics_train.json", "metrics.json"):
         if (folder / name).is_file():
-            return read_metrics(folder / name)
+            metrics = read_metrics(folder / name)
+            early = metrics.get("command") == "evaluate" and (folder / "checkpoints").is_dir()
+            return {} if early else metrics  # of a checkpoint of a training that has not ended
     return {}
 
 
