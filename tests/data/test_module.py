@@ -6,6 +6,7 @@ import subprocess
 import sys
 import textwrap
 from functools import partial
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -324,6 +325,23 @@ def test_workers_that_persist_see_the_epoch_change(root):
         shades.append(batch.rgb[batch.frame_id.argsort()][:, 0, 0, 0])
     assert not torch.equal(shades[0], shades[1])
     assert torch.equal(shades[0], shades[2])
+
+
+@pytest.mark.parametrize(("limit", "batches"), [(2, 2), (0.5, 2), (9, 4), (1.0, 4)])
+def test_after_a_whole_epoch_a_run_goes_on_with_the_start_of_the_next(root, limit, batches):
+    """Also where the trainer takes a part of an epoch's batches."""
+    dm = module(root, image_width=80, split={"train": 1.0}, batch_size=4)
+    device = SimpleNamespace(root_device=torch.device("cpu"))
+    dm.trainer = SimpleNamespace(
+        global_rank=0, world_size=1, limit_train_batches=limit, strategy=device
+    )
+    loader = dm.train_dataloader()
+    for _ in zip(range(batches), loader, strict=False):
+        pass
+    again, uncut = dm.train_dataloader(), dm.train_dataloader()
+    again.load_state_dict(loader.state_dict())
+    first, second = (next(iter(one)).frame_id.tolist() for one in (again, uncut))
+    assert first == second
 
 
 def test_a_script_ends_that_still_refers_to_its_loaders_batches(root):

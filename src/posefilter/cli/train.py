@@ -28,6 +28,7 @@ from posefilter.cli.resume import LAST, list_unkept
 from posefilter.cli.reuse import find_begun, finished, learned_from, start_from, take_over
 from posefilter.cli.stopping import stopped_by_interrupt
 from posefilter.cli.warm_start import read_starts, warm_start
+from posefilter.data.loaders import count_batches
 from posefilter.data.module import PoseDataModule
 from posefilter.errors import Stopped, UserError
 from posefilter.metrics.results import compute_checkpoint_score
@@ -181,9 +182,7 @@ def check_validated(run: Run) -> None:
                 f"trainer.{name}=0: a training needs its validations, which choose the best "
                 "checkpoint"
             )
-    limit = trainer.limit_train_batches
-    batches = len(run.data.train_dataloader())
-    batches = min(batches, limit) if isinstance(limit, int) else int(limit * batches)
+    batches = count_batches(len(run.data.train_dataloader()), trainer.limit_train_batches)
     _check_epochs(trainer, batches)
     if every is None or trainer.max_steps < 0:
         return

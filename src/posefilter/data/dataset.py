@@ -152,8 +152,12 @@ class EpochShuffle(Sampler[int]):
 class ResumableLoader(DataLoader[Batch]):
     """A loader that knows how many batches it has given; Lightning keeps that in checkpoints, and
     hands it back.
+
+    Attributes:
+        batches: That an epoch takes of it; None: all.
     """
 
+    batches: int | None = None
     _given = 0
     _start = 0
 
@@ -176,7 +180,7 @@ class ResumableLoader(DataLoader[Batch]):
 
     def load_state_dict(self, state: dict[str, int]) -> None:
         """Go on from there; after a whole epoch, from the start of the next."""
-        self._start = state["given"] % max(len(self), 1)
+        self._start = state["given"] % max(self.batches or len(self), 1)
 
 
 _ITERATED: WeakSet[ResumableLoader] = WeakSet()

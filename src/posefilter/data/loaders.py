@@ -5,12 +5,10 @@ from typing import Any
 
 import cv2
 import torch
-from torch.utils.data import DataLoader
 
 from posefilter.data.dataset import FrameDataset, ResumableLoader
 from posefilter.errors import UserError
 from posefilter.signals import leave_signals_to_parent
-from posefilter.types import Batch
 
 
 def spare_cores(max_cores: int = 4) -> int:
@@ -29,9 +27,19 @@ def spare_cores(max_cores: int = 4) -> int:
     return max(0, min(max_cores, cores - busy))
 
 
+def count_batches(there: int, limit: int | float) -> int:
+    """Return how many batches an epoch takes of those that are there, as Lightning counts them.
+
+    Args:
+        there: Batches of the loader.
+        limit: The trainer's `limit_train_batches`: a number, or a share.
+    """
+    return min(there, limit) if isinstance(limit, int) else int(limit * there)
+
+
 def make_loader(
     dataset: FrameDataset, batch_size: int, workers: int, *, for_gpu: bool = False, **options: Any
-) -> DataLoader[Batch]:
+) -> ResumableLoader:
     """Return a loader that can be resumed.
 
     Args:

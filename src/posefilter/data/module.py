@@ -17,7 +17,7 @@ from posefilter.data.dataset import EpochShuffle, FrameDataset
 from posefilter.data.decoding import FrameDecoder
 from posefilter.data.frames import FrameRecord
 from posefilter.data.generated_scenes import ensure_scenes
-from posefilter.data.loaders import make_loader, spare_cores
+from posefilter.data.loaders import count_batches, make_loader, spare_cores
 from posefilter.data.points import read_model_points
 from posefilter.data.prepare import usable
 from posefilter.data.readers.base import BaseReader
@@ -289,7 +289,7 @@ class PoseDataModule(LightningDataModule):
         place = (0, 1) if trainer is None else (trainer.global_rank, trainer.world_size)
         order = EpochShuffle(len(dataset), self._seed, dataset.set_epoch, *place)
         full = len(order) >= self._batch_size
-        return make_loader(
+        loader = make_loader(
             dataset,
             self._batch_size,
             self._workers,
@@ -297,6 +297,9 @@ class PoseDataModule(LightningDataModule):
             sampler=order,
             drop_last=full,
         )
+        if trainer is not None:
+            loader.batches = count_batches(len(loader), trainer.limit_train_batches)
+        return loader
 
     @property
     def _goes_to_gpu(self) -> bool:
