@@ -232,3 +232,5 @@ def test_a_run_that_was_evaluated_since_keeps_its_row(sweep: Path) -> None:
     shutil.copy2(own / "metrics.json", own / "evaluation_1")
     after = read_sweep(sweep)
     assert (after.axes, after.jobs) == (before.axes, before.jobs)
+    with pytest.raises(UserError, match="is a run's folder; give it as run="):
+        read_sweep(own)

@@ -76,8 +76,9 @@ def read_sweep(folder: Path) -> Sweep:
     if not folder.is_dir():
         raise UserError(f"sweep={folder}: no such folder")
     marks = ("metrics.json", "failed.json")
-    found = sorted({path.parent for mark in marks for path in folder.rglob(mark)} - {folder})
-    found = [one for one in found if {*one.parents}.isdisjoint(found)]  # less a run's evaluations
+    known = {path.parent for mark in marks for path in folder.rglob(mark)}
+    # less evaluations within a run's folder
+    found = sorted(one for one in known - {folder} if known.isdisjoint(one.parents))
     if not found and not any((folder / mark).is_file() for mark in SWEEP_MARKS):
         own = (folder / ".hydra").is_dir()
         kind = f"is a run's folder; give it as run={folder}" if own else "is no sweep's folder"
