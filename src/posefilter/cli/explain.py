@@ -23,7 +23,6 @@ from posefilter.cli.plain import to_plain
 from posefilter.cli.renamed import rename_argument, rename_missing
 from posefilter.errors import find_reason
 
-# choices that packages of others bring
 # settings of Lightning's Trainer, which is not imported to tell a mistake
 LIGHTNINGS = (
     *("accelerator", "accumulate_grad_batches", "benchmark", "check_val_every_n_epoch"),
@@ -35,6 +34,9 @@ LIGHTNINGS = (
     *("sync_batchnorm", "use_distributed_sampler", "val_check_interval"),
 )
 _FORMS = {"intrinsics": "fx,fy,cx,cy", "distortion": "k1,k2,p1,p2,k3"}  # of lists of numbers
+# what Hydra says of a choice that is made already, and of a setting that there is
+_THERE = re.compile(r"(?:Multiple values for |.* already at ')(\S+?)(?:\. |')")
+# choices that packages of others bring
 _EXTRA = ("optuna", "joblib", "submitit_local", "submitit_slurm")
 
 
@@ -77,10 +79,10 @@ def explain(error: BaseException, name: str, conf: Path, arguments: list[str]) -
             if new is not None:
                 return f"{key}: is now {section}.{new}"
             return f"{key}: there is no such setting{near(key, known_keys(cfg, key))}"
-        if found := re.match(r"Multiple values for (\S+)\. ", text):
-            added = [a for a in arguments if re.match(rf"\+{re.escape(found[1])}=", a)]
+        if found := _THERE.match(text):
+            added = [a for a in arguments if a.startswith(f"+{found[1]}=")]
             if added:  # else a file's list of defaults lacks `override`, as Hydra says
-                return f"{added[0]}: a choice of {found[1]} is made already; type {added[0][1:]}"
+                return f"{added[0]}: + adds what is not there yet; type {added[0][1:]}"
     if isinstance(error, OverrideParseException):
         return (
             f"{error.override}: cannot be read ({first_line(error)}){_tell_quotes(error.override)}"
