@@ -152,7 +152,7 @@ def test_saving_says_nothing(tmp_path: Path, caplog: pytest.LogCaptureFixture) -
 class TwoProcesses:
     """A trainer of two processes, of which the other decides."""
 
-    world_size = 2
+    world_size, accumulate_grad_batches = 2, 1
     callbacks: ClassVar[list[Callback]] = []
 
     def __init__(self, other: bool) -> None:
@@ -192,6 +192,38 @@ def test_a_signal_between_two_batches_waits_for_the_checkpoint() -> None:
     stop._note(signal.SIGINT, None)
     stop.on_train_batch_start()  # nothing was written since the last batch: one more is done
     stop.on_train_batch_end(alone, None)  # type: ignore[arg-type]
+    with pytest.raises(Stopped):
+        stop.on_train_batch_start()
+
+
+def test_what_a_run_goes_on_from_is_written_where_no_gradients_wait(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """No checkpoint has them: the step would be done without the batches before it."""
+    stop, last = Stop(), Last(str(tmp_path), minutes=60)
+    waits = [True]
+    loop = SimpleNamespace(_should_accumulate=lambda: waits[0], _data_fetcher=1)
+    loop._should_check_val_fx = lambda fetcher: False
+    written: list[Path] = []
+    trainer: Any = SimpleNamespace(
+        accumulate_grad_batches=2,
+        callbacks=[stop, last],
+        fit_loop=SimpleNamespace(epoch_loop=loop, _data_fetcher=1),
+        is_global_zero=False,
+        save_checkpoint=lambda path, **_: written.append(path),
+        sanity_checking=False,
+        world_size=1,
+    )
+    last._saved_at = time.monotonic()
+    last.on_validation_end(trainer, None)  # type: ignore[arg-type]
+    stop._note(signal.SIGTERM, None)
+    for waiting in (True, False):
+        waits[0] = waiting
+        for one in (stop, last):
+            one.on_train_batch_end(trainer, None)  # type: ignore[arg-type]
+        assert bool(written) == (not waiting)
+        if waiting:
+            stop.on_train_batch_start()  # the batch that completes the step
     with pytest.raises(Stopped):
         stop.on_train_batch_start()
 

@@ -12,7 +12,7 @@ from lightning.pytorch.callbacks import Checkpoint, ModelCheckpoint
 from torch import Tensor
 
 from posefilter.cli.resume import BEFORE, LAST
-from posefilter.cli.stopping import any_process, asked_to_stop
+from posefilter.cli.stopping import any_process, asked_to_stop, is_accumulating
 from posefilter.errors import UserError
 from posefilter.metrics.registry import HIGHER, LOWER, find_metric
 
@@ -77,7 +77,7 @@ class Best(ModelCheckpoint):
 
 class Last(Checkpoint):
     """Write what a run is resumed from: at each validation, every few minutes, and when it is
-    interrupted.
+    interrupted; where gradients are accumulated, once the step is complete.
 
     The checkpoint before it is kept as last.previous.ckpt, for the day on which the last is broken.
 
@@ -139,6 +139,9 @@ class Last(Checkpoint):
         return late or asked_to_stop(trainer)
 
     def _save(self, trainer: Trainer) -> None:
+        if is_accumulating(trainer):
+            self._saved_at = -math.inf  # as soon as the step is complete
+            return
         new = self.path.with_name(f"new_{LAST}")
         trainer.save_checkpoint(new, weights_only=False)  # unset, Lightning logs that it is False
         if trainer.is_global_zero:

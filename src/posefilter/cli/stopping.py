@@ -16,7 +16,8 @@ class Stop(Callback):
     """Take note of a signal, and stop after a batch; at a second signal, stop at once.
 
     A signal is acted on at the end of a batch, where `Last`, which comes after this, writes its
-    checkpoint; the next batch is not begun. There the processes of one training agree on it, since
+    checkpoint; the next batch is not begun. Where gradients are accumulated it is the batch that
+    completes a step. There the processes of one training agree on it, since
     a signal reaches them at different steps, and one that stopped alone would leave the others
     waiting for it.
     """
@@ -24,6 +25,7 @@ class Stop(Callback):
     def __init__(self) -> None:
         self.asked: int | None = None  # the signal that came
         self.agreed: int | None = None  # the one that all processes stop for
+        self._waits = False  # for the end of a step
 
     def _listen(self, *_: Any, **__: Any) -> None:
         # Lightning's own handlers save nothing; it puts back those before when the training ends
@@ -40,13 +42,23 @@ class Stop(Callback):
         if any_process(trainer, self.asked is not None):
             self.agreed = self.asked or signal.SIGTERM
 
+    def on_train_batch_end(self, trainer: Trainer, *_: Any) -> None:
+        """Agree on a signal; note whether the step is complete."""
+        self._agree(trainer)
+        self._waits = is_accumulating(trainer)
+
+    def on_train_batch_start(self, *_: Any) -> None:
+        """Stop, unless the batch belongs to a step that has begun."""
+        if not self._waits:
+            self._stop()
+
     def _stop(self, *_: Any, **__: Any) -> None:
         if self.agreed is not None:
             raise Stopped(self.agreed)
 
     on_sanity_check_start = on_train_start = on_test_start = _listen
-    on_train_batch_start = on_validation_batch_start = _stop
-    on_train_batch_end = on_validation_start = on_validation_batch_end = _agree
+    on_validation_batch_start = _stop
+    on_validation_start = on_validation_batch_end = _agree
 
     def on_test_batch_start(self, *_: Any) -> None:
         """Stop at once: a test has no checkpoint to write, and no other process waits for it."""
@@ -65,6 +77,14 @@ def stopped_by_interrupt() -> Iterator[None]:
         if isinstance(ended.__context__, KeyboardInterrupt):
             raise Stopped(signal.SIGINT) from ended
         raise
+
+
+def is_accumulating(trainer: Trainer) -> bool:
+    """Tell whether gradients of the last batches wait for those of others: no checkpoint has them,
+    so that a run that went on from here would lose them.
+    """
+    several = trainer.accumulate_grad_batches > 1
+    return several and trainer.fit_loop.epoch_loop._should_accumulate()
 
 
 def asked_to_stop(trainer: Trainer) -> bool:
