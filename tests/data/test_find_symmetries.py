@@ -96,6 +96,21 @@ def test_a_dent_spoils_a_symmetry() -> None:
     assert find_symmetries(replace(box, vertices=vertices)) == []
 
 
+def test_a_badly_measured_axis_costs_none_of_the_others() -> None:
+    """A box of square section has eight symmetries, also where a diagonal axis is 3 degrees off."""
+    axes = np.array([[1, 0, 0], [0, 0, 1], [0, 1, 0], [0.748, -0.664, 0], [-0.664, -0.748, 0]])
+    turns = [
+        RotationalSymmetry(
+            axis / np.linalg.norm(axis), np.zeros(3), fold, 0.0, 0.0, 0.0, True, True
+        )
+        for axis, fold in zip(axes, (2, 4, 2, 2, 2), strict=True)
+    ]
+    group = make_group(turns, 0.2)
+    assert len(group) == 8
+    for product in (a @ b for a in group for b in group):
+        assert distance_to(group, product) < 1e-9
+
+
 def test_the_picture_has_a_row_a_turn() -> None:
     mesh = catalog.build("brick")
     size = diameter(mesh.vertices)

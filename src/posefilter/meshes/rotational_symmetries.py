@@ -12,6 +12,7 @@ from posefilter.meshes.symmetries import rotation_about, symmetry_group
 ANY = 0  # the fold of a turn by any angle
 _PARALLEL = np.cos(np.deg2rad(10.0))
 _MOST_ELEMENTS = 60  # of a finite group of turns that is not of one axis
+_SMALLEST = np.deg2rad(25.0)  # turn in a group of turns by a quarter and more
 
 
 class RotationalSymmetry(NamedTuple):
@@ -80,14 +81,18 @@ def make_group(turns: Sequence[RotationalSymmetry], size: float, steps: int = 36
 def list_discrete(turns: Sequence[RotationalSymmetry], size: float) -> list[np.ndarray]:
     """Return every product of the discrete turns but the identity, (4, 4) each.
 
-    Where the products of turns about several axes do not close, as they do in a group, those of the
-    best turn's axis alone.
+    A turn whose products with those before it, which fit better, do not close, as they do in a
+    group, is left out: its axis is measured too badly.
     """
-    discrete = [turn for turn in turns if turn.fold != ANY]
-    generators = [rotation_about(t.axis, 2 * np.pi / t.fold, t.point) for t in discrete]
-    group = _close(generators, size)
-    if len(group) > _MOST_ELEMENTS:
-        group = _close(generators[:1], size)
+    kept: list[np.ndarray] = []
+    group = _close(kept, size)
+    for turn in turns:
+        if turn.fold == ANY:
+            continue
+        more = [*kept, rotation_about(turn.axis, 2 * np.pi / turn.fold, turn.point)]
+        products = _close(more, size)
+        if len(products) <= _MOST_ELEMENTS and min(map(_measure, products[1:])) > _SMALLEST:
+            kept, group = more, products
     return group[1:]
 
 
@@ -143,6 +148,11 @@ def _close(generators: Sequence[np.ndarray], size: float) -> list[np.ndarray]:
         if len(group) > _MOST_ELEMENTS:
             break
     return group
+
+
+def _measure(transform: np.ndarray) -> float:
+    """Return the angle of a turn (4, 4) [rad]."""
+    return float(np.arccos(np.clip((np.trace(transform[:3, :3]) - 1) / 2, -1, 1)))
 
 
 def _differ(a: np.ndarray, b: np.ndarray, size: float) -> bool:
