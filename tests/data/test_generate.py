@@ -326,6 +326,25 @@ def test_a_dataset_is_not_gone_on_with_once_its_mesh_has_changed(tmp_path: Path)
     assert generate(out, 3, **how).rendered == 1
 
 
+def test_a_scene_is_not_gone_on_with_once_what_stands_beside_the_object_has_changed(
+    tmp_path: Path,
+) -> None:
+    """The numbers in the images of its frames would mean other classes."""
+    meshes, out = write_meshes(tmp_path / "meshes"), tmp_path / "out"
+    how = {"object": "box0", "distractors": (0, 1), "progress": False}
+    how |= {"size": (96, 72), "workers": 1}
+    assert generate(out, 3, meshes=meshes, **how).rendered == 3
+    begun = out / "mixed" / "scene0001_0"
+    before = contents(begun)
+    trimesh.creation.box([0.1, 0.1, 0.1]).export(meshes / "a_box.ply")
+    with pytest.raises(UserError, match=r"scene0001_0: .*other meshes.*delete this folder"):
+        generate(out, 4, meshes=meshes, **how)
+    assert contents(begun) == before
+    shutil.rmtree(begun)
+    # a slash behind a folder's name, as shells complete it, is no other folder
+    assert generate(out, 4, meshes=f"{meshes}/", **how).rendered == 2
+
+
 def test_a_record_from_before_meshes_had_a_scale_goes_on(alone: Path, tmp_path: Path) -> None:
     out = tmp_path / "copy"
     shutil.copytree(alone, out)

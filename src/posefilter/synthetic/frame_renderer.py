@@ -1,5 +1,6 @@
 """Render the frames of a generated dataset; each depends on settings, seed and its number alone."""
 
+import json
 from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
@@ -115,7 +116,11 @@ class FrameRenderer:
         self.scenario = lru_cache(maxsize=1)(self._draw_scenario)
 
     def _draw_scene(self, number: int) -> tuple[SceneSet, dict[str, fat.ExportedObject]]:
-        """Return a folder's scene set and its classes by name; write the folder's settings."""
+        """Return a folder's scene set and its classes by name; write the folder's settings.
+
+        Raises:
+            UserError: The folder has frames of other classes.
+        """
         rng = self.job.scene_generator(number)
         scene = draw_scene_set(self.library, self.job.object, self.job.scenes, rng)
         solids = (scene.target, *scene.distractors, *scene.lookalikes)
@@ -124,7 +129,9 @@ class FrameRenderer:
         folder = self.out / self.job.folder(number * self.job.frames_per_scene)
         folder.mkdir(parents=True, exist_ok=True)
         names = [name for name, _ in self.job.cameras()]
-        fat.write_json(folder / fat.OBJECT_SETTINGS, fat.object_settings(exported))
+        settings = fat.object_settings(exported)
+        _check_begun(folder, settings)
+        fat.write_json(folder / fat.OBJECT_SETTINGS, settings)
         camera = fat.camera_settings(self.K, self.job.height, self.job.width, names)
         fat.write_json(folder / fat.CAMERA_SETTINGS, camera)
         return scene, {one.name: one for one in exported}
@@ -249,3 +256,19 @@ class FrameRenderer:
         frame = np.array([[[-0.5, -0.5]], [[w, -0.5]], [[w, h]], [[-0.5, h]]], np.float32)
         inside, _ = cv2.intersectConvexConvex(outline, frame)
         return float(np.clip(1 - inside / max(cv2.contourArea(outline), 1e-6), 0, 1))
+
+
+def _check_begun(folder: Path, settings: dict[str, Any]) -> None:
+    """Raise UserError where a folder has frames of other classes than its settings would name."""
+    path = folder / fat.OBJECT_SETTINGS
+    if not path.is_file() or not any(folder.glob("[0-9]*.json")):
+        return
+    try:
+        there = json.loads(path.read_bytes())
+    except ValueError:
+        there = None
+    if there != settings:
+        raise UserError(
+            f"{folder}: begun with other meshes, which were added or changed since; delete this "
+            f"folder, and it is rendered anew"
+        )

@@ -222,7 +222,7 @@ def _make_job(given: Mapping[str, Any]) -> Job:
     shift, turn = float(given["moving_mm"]), float(given["moving_deg"])
     return Job(
         given["object"],
-        str(given["meshes"]),
+        _plain_folder(given["meshes"]),
         int(given["seed"]),
         width,
         height,
@@ -235,6 +235,9 @@ def _make_job(given: Mapping[str, Any]) -> Job:
         1.0 if given["mesh_scale"] is None else float(given["mesh_scale"]),
         MotionSettings(moving, shift, turn, int(given["fully_occluded_frames"])),
     )
+def _plain_folder(meshes: str | Path) -> str:
+    """Return a folder without the slash that shells put behind its name."""
+    return str(meshes).rstrip("/") or "/"
 
 
 def camera_matrix(camera: str | Sequence[float], width: int, height: int) -> np.ndarray:
@@ -437,5 +440,6 @@ def _with_defaults(settings: dict[str, Any]) -> dict[str, Any]:
     texture = scenes["lookalike_texture"]
     scenes["lookalike_texture"] = {"other": "different", "own": "same"}.get(texture, texture)
     motion = {**asdict(MotionSettings()), **_by_todays_names(settings.get("motion", {}))}
-    out = {"mesh_scale": 1.0, **settings, "scenes": scenes, "motion": motion}
+    meshes = _plain_folder(settings.get("meshes", BUILTIN))
+    out = {"mesh_scale": 1.0, **settings, "meshes": meshes, "scenes": scenes, "motion": motion}
     return {**out, "renderer": "opengl"} if out.get("renderer") == "moderngl" else out
