@@ -103,6 +103,7 @@ WRONG = {
     "depth x 1000": ({"factor_depth": 10.0}, "depth is 1000 times"),
     "millimeters": ({"poses": scaled(1000)}, "translations are in millimeters"),
     "centimeters": ({"poses": scaled(100)}, "translations are in centimeters"),
+    "ten times too far": ({"poses": scaled(10)}, "translations are too large by a factor of 10 "),
     "kilometers": ({"poses": scaled(0.001)}, "translations are too small by a factor of 1000"),
     "inverse": ({"poses": inverted}, "wrong way round"),
     "frame": (
@@ -167,6 +168,18 @@ def test_a_centered_frame_is_named(tmp_path, meshes):
         (folder / "scene_gt.json").write_text(json.dumps(content))
     report = check_dataset(BopReader(tmp_path, "obj_000002", meshes), meshes)
     assert "center of the bounding box" in report["problems"][0]
+
+
+@pytest.mark.parametrize(
+    ("unit", "told"), [(0.1, "small by a factor of 10: .* by 10 "), (10, "large .* by 0.1 ")]
+)
+def test_a_mesh_in_another_unit_is_not_taken_for_wrong_poses_and_depth(
+    tmp_path, meshes, unit, told
+):
+    wrong = MeshStore(meshes.root, scale=unit)
+    bop_scene(tmp_path / "000001", [[(2, each)] for each in POSES])
+    (problem,) = check_dataset(BopReader(tmp_path, "obj_000002", wrong), wrong)["problems"]
+    assert re.search(f"the mesh is too {told}", problem)
 
 
 def test_a_wrong_mesh_is_a_problem_without_a_cause(tmp_path, meshes):

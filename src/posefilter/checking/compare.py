@@ -19,7 +19,7 @@ _RATIO_TOLERANCE = 0.05
 # of pictures whose intrinsics may have been mixed up
 _WIDTHS = (160, 320, 480, 640, 720, 960, 1280, 1920)
 _POWERS = (0.001, 0.01, 0.1, 10.0, 100.0, 1000.0)
-_UNITS = {0.001: "are in millimeters", 0.01: "are in centimeters", 0.1: "are in decimeters"}
+_UNITS = {0.001: "are in millimeters", 0.01: "are in centimeters"}
 
 
 @dataclass(frozen=True)
@@ -94,10 +94,14 @@ def likely_causes(views: Sequence[View], geometry: Geometry, before: float) -> l
     as_read = [compare(view, geometry) for view in views]
     found, judged = [], as_read
     if scores[best] > before + max(0.05, 0.5 * (1 - before)) and scores[best] > 0.7:
-        found.append(
-            f"{words[best]} (silhouette IoU {before:.2f}, with that undone {scores[best]:.2f})"
-        )
+        ious = f"(silhouette IoU {before:.2f}, with that undone {scores[best]:.2f})"
+        found.append(f"{words[best]} {ious}")
         judged = fits[best]
+        factor = _POWERS[best] if best < len(_POWERS) else 1.0  # of the translations
+        # an object as many times larger and farther looks the same
+        if factor != 1 and abs(_measure_depth(judged) * factor - 1) < 0.1:
+            larger = _tell_factor(1 / factor)
+            return [f"the mesh is too {larger}: multiply mesh_scale by {1 / factor:g} {ious}"]
     return found + _depth_scale(judged)
 
 
@@ -128,7 +132,7 @@ def list_causes(view: View) -> list[tuple[str, np.ndarray, np.ndarray]]:
     for factor in _POWERS:
         scaled = native.copy()
         scaled[:3, 3] *= factor
-        words = _UNITS.get(factor, f"are too small by a factor of {factor:g}")
+        words = _UNITS.get(factor, f"are too {_tell_factor(factor)}")
         out.append((f"translations {words}", scaled @ mesh, K))
     transposed = native.copy()
     transposed[:3, :3] = native[:3, :3].T
@@ -148,14 +152,26 @@ def list_causes(view: View) -> list[tuple[str, np.ndarray, np.ndarray]]:
     return out
 
 
-def _depth_scale(fits: Sequence[Fit]) -> list[str]:
-    """Return what is wrong with the scale of depth, where silhouettes agree."""
+def _tell_factor(factor: float) -> str:
+    """Return by how much lengths are off that are right times a factor."""
+    size = "small" if factor > 1 else "large"
+    return f"{size} by a factor of {max(factor, 1 / factor):g}"
+
+
+def _measure_depth(fits: Sequence[Fit]) -> float:
+    """Return measured over rendered depth, where silhouettes agree; NaN where that varies."""
     good = [fit for fit in fits if fit.iou > 0.7 and np.isfinite(fit.depth_ratio)]
     if not good:
-        return []
+        return float("nan")
     ratio = float(np.median([fit.depth_ratio for fit in good]))
     spread = float(np.median([fit.ratio_spread for fit in good]))
-    if abs(ratio - 1) < 0.02 or spread > 0.1 * ratio:
+    return ratio if spread <= 0.1 * ratio else float("nan")
+
+
+def _depth_scale(fits: Sequence[Fit]) -> list[str]:
+    """Return what is wrong with the scale of depth, where silhouettes agree."""
+    ratio = _measure_depth(fits)
+    if not abs(ratio - 1) >= 0.02:
         return []
     power = next((p for p in _POWERS if abs(ratio / p - 1) < 0.1), None)
     number = f"{power:g}" if power else f"{ratio:.3g}"
