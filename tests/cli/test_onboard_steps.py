@@ -7,7 +7,7 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
-from omegaconf import OmegaConf
+from omegaconf import DictConfig, OmegaConf
 
 from posefilter.cli import onboard as command
 from posefilter.cli import run_command
@@ -16,6 +16,7 @@ from posefilter.cli.onboard import STAGES, Onboarding, choose_steps
 from posefilter.cli.stages import Stages
 from posefilter.errors import UserError
 from posefilter.meshes.builtin.catalog import build, names
+from posefilter.paths import find_conf
 
 
 @pytest.mark.parametrize("step", [0.05, 0.3, 0.4, 4.0])
@@ -131,3 +132,15 @@ def test_other_symmetries_are_refused_before_they_replace_those_of_the_training(
     assert file.read_text() == before
     assert run_command("onboard", arguments=typed) == 2
     assert capfd.readouterr().err.splitlines()[-1].endswith("stopped here")
+
+
+def test_a_folder_may_have_any_name(tmp_path: Path) -> None:
+    out = tmp_path / "Mike's drill, new=1"
+    cfg = OmegaConf.load(find_conf() / "onboard.yaml")
+    assert isinstance(cfg, DictConfig)
+    cfg.warm_start = "Mike's.ckpt"
+    mesh = build("brick")
+    training = Onboarding(cfg, mesh, out, Stages(out / "onboarding.json", {})).job(out / "training")
+    assert training.cfg.data.root == str(out / "data")
+    assert training.cfg.data.meshes == str(out / "meshes")
+    assert training.cfg.warm_start == "Mike's.ckpt"

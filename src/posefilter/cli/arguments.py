@@ -116,13 +116,17 @@ def quoted(arguments: Sequence[str], command: str = "") -> list[str]:
         odd |= is_place and _NUMBER.fullmatch(value) is not None
         signs = re.search(r"[][(){}'\", ]", value) is not None and "${" not in value
         if is_place and signs and _exists(value):  # such as "IMG (1).png"
-            argument = f"{key}='" + value.replace("'", "\\'") + "'"
+            argument = f"{key}={quote(value)}"
         elif odd and re.fullmatch(r"[+~]{0,2}[\w./@]+", key) and not _written(value):
             values = [value] if _exists(value) else value.split(",")
-            parts = (part.replace("'", "\\'") for part in values)
-            argument = f"{key}=" + ",".join(f"'{part}'" for part in parts)
+            argument = f"{key}=" + ",".join(map(quote, values))
         out.append(argument)
     return out
+
+
+def quote(value: object) -> str:
+    """Return a value as Hydra reads it back unchanged, whatever characters it has."""
+    return "'" + str(value).replace("'", "\\'") + "'"
 
 
 def _exists(path: str) -> bool:
@@ -225,6 +229,6 @@ def spelled(arguments: Sequence[str]) -> list[str]:
     for argument in arguments:
         key, found, value = argument.partition("=")
         if found and key in _FOLDERS and value and value[0] not in "'\"" and value != "null":
-            value = "'" + value.replace("'", "\\'") + "'"
+            value = quote(value)
         out.append(f"{'sweep_folder' if key == 'sweep' else key}{found}{value}")
     return out

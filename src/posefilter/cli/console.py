@@ -16,6 +16,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
+from posefilter.cli.arguments import quote
 from posefilter.cli.choices import config_folders, typed_plugins
 from posefilter.cli.ranks import is_follower
 
@@ -104,7 +105,7 @@ def setting(key: str, value: Any) -> str:
         return shlex.quote(f"{key}=[{','.join(map(str, value))}]")
     text = str(value)
     if not re.fullmatch(r"[\w./:\-~ ]*", text):
-        text = "'" + text.replace("'", "\\'") + "'"
+        text = quote(text)
     return shlex.quote(f"{key}={text}") if re.search(r"[^\w./:\-=~]", text) else f"{key}={text}"
 
 

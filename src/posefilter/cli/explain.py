@@ -17,6 +17,7 @@ from hydra.errors import (
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 
+from posefilter.cli.arguments import quote
 from posefilter.cli.choices import config_folders, list_choices
 from posefilter.cli.instantiate import hint
 from posefilter.cli.plain import to_plain
@@ -107,8 +108,7 @@ def _tell_quotes(argument: str) -> str:
         return ""
     if form := _FORMS.get(key):
         return f"; it is typed {key}={form}"
-    escaped = value.replace("'", "\\'")
-    text = f"{key}='{escaped}'"
+    text = f"{key}={quote(value)}"
     typed = shlex.quote(text) if re.search(r'["$`\\!]', text) else f'"{text}"'
     return f"; as one text it is typed {typed}"
 

@@ -16,6 +16,7 @@ import numpy as np
 from omegaconf import DictConfig, OmegaConf
 
 from posefilter.callbacks.time_budget import TimeBudget
+from posefilter.cli.arguments import quote
 from posefilter.cli.build import build_data
 from posefilter.cli.calibrate import learn
 from posefilter.cli.checkpoints import method_of, read_checkpoint
@@ -144,7 +145,7 @@ class Onboarding:
             "filter.max_searches=4",
             "data=scenes",
             "data/augment=camera_magnified",  # as the magnified windows are
-            *(f"{key}='{value}'" for key, value in quoted.items()),
+            *(f"{key}={quote(value)}" for key, value in quoted.items()),
             f"data.generate.frames={self.frames}",
             f"data.generate.workers={self.cfg.workers}",
             "data.generate.frames_per_scene=2",  # few scenes would be learned by heart
@@ -159,9 +160,9 @@ class Onboarding:
         ]
         start = _plain(self.cfg.warm_start)
         if isinstance(start, list):
-            words.append("warm_start=[" + ",".join(f"'{one}'" for one in start) + "]")
+            words.append("warm_start=[" + ",".join(map(quote, start)) + "]")
         elif start is not None:
-            words.append(f"warm_start='{start}'")
+            words.append(f"warm_start={quote(start)}")
         words += [*map(str, self.cfg.train_overrides), *more]
         return replace(compose_job("train", find_conf(), words, folder), swept=True)
 
