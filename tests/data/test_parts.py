@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+import trimesh
 from dataset_trees import BOXES, K, bop_scene, pose, write_mesh
 
 from posefilter.cli.archive import _check_object
@@ -29,6 +30,19 @@ def meshes(tmp_path: Path) -> MeshStore:
     root = write_mesh(tmp_path / "meshes", "obj_000002")
     (root / "obj_000002" / "parts.json").write_text(json.dumps(PARTS))
     return MeshStore(root)
+
+
+def test_vertices_are_counted_as_the_file_does(tmp_path: Path) -> None:
+    """Some that no face uses come first."""
+    box = trimesh.creation.box([0.1, 0.2, 0.06])
+    rows = ["v 9 9 9", "v 8 8 8", *(f"v {x} {y} {z}" for x, y, z in box.vertices)]
+    rows += [f"f {a} {b} {c}" for a, b, c in box.faces + 3]
+    (tmp_path / "box.obj").write_text("\n".join(rows))
+    listed = (np.flatnonzero(box.vertices[:, 0] < 0) + 2).tolist()
+    (tmp_path / "parts.json").write_text(json.dumps({"box": {"left": {"vertices": listed}}}))
+    mesh = MeshStore(tmp_path).load("box")
+    left = (mesh.vertices[mesh.faces][..., 0] < 0).sum(axis=1) >= 2
+    np.testing.assert_array_equal(mesh.parts["left"], left)
 
 
 def test_a_list_of_vertices_has_the_faces_between_them(meshes: MeshStore) -> None:

@@ -86,7 +86,7 @@ def _finish(raw: RawMesh, path: Path, name: str, scale: float) -> Mesh:
             given = -given
         normals = np.where(length > 1e-6, given, normals).astype(np.float32)
     uv, texture, colors = merge_materials(raw, path)
-    return Mesh(name, vertices, faces, uv, texture, colors, normals)
+    return Mesh(name, vertices, faces, uv, texture, colors, normals, numbers=used)
 
 
 def _reverse_corners(raw: RawMesh) -> RawMesh:

@@ -50,6 +50,8 @@ class Mesh:
     symmetries: np.ndarray = field(default_factory=_identity)
     # (F,) bool by part: the faces of each, disjoint; see meshes/parts.py
     parts: Mapping[str, np.ndarray] = field(default_factory=dict)
+    # (V,) each vertex's number in its file, which may have others that no face uses; None: the same
+    numbers: np.ndarray | None = None
 
     @cached_property
     def bounds(self) -> np.ndarray:

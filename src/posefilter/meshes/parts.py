@@ -32,8 +32,9 @@ def read_parts(file: Path, name: str, scale: float, mesh: Mesh) -> dict[str, np.
 
     The file maps objects to parts, `{"hammer": {"head": {"box": [[...], [...]]}}}`; a file in the
     object's own folder may hold its parts alone. A part is an axis-aligned box (two corners, in the
-    unit of the mesh file), which has the faces whose center is in it, or a list of vertices, which
-    has the faces with at least two corners in it. A face belongs to the first part that has it.
+    unit of the mesh file), which has the faces whose center is in it, or a list of the file's
+    vertices, counted from 0, which has the faces with at least two corners in it. A face belongs to
+    the first part that has it.
 
     Args:
         file: The file.
@@ -125,6 +126,7 @@ def take_faces(mesh: Mesh, keep: np.ndarray, name: str) -> Mesh:
         corner_normals=mesh.corner_normals[keep],
         symmetries=np.eye(4)[None],
         parts={},
+        numbers=None if mesh.numbers is None else mesh.numbers[used],
     )
 
 
@@ -139,11 +141,10 @@ def _select(one: Any, scale: float, mesh: Mesh, said: str) -> np.ndarray:
             listed = np.array(one["vertices"])
             if listed.ndim != 1 or listed.dtype.kind not in "iu":
                 raise ValueError("vertices are counted from 0")
-            if len(listed) == 0 or listed.min() < 0 or listed.max() >= len(mesh.vertices):
-                raise ValueError(f"the mesh has vertices 0 to {len(mesh.vertices) - 1}")
-            has = np.zeros(len(mesh.vertices), dtype=bool)
-            has[listed] = True
-            corners_in: np.ndarray = has[mesh.faces].sum(axis=1) >= 2
+            numbers = np.arange(len(mesh.vertices)) if mesh.numbers is None else mesh.numbers
+            if len(listed) == 0 or listed.min() < 0 or listed.max() > numbers.max():
+                raise ValueError(f"the mesh has vertices 0 to {numbers.max()}")
+            corners_in: np.ndarray = np.isin(numbers, listed)[mesh.faces].sum(axis=1) >= 2
             return corners_in
     except (TypeError, ValueError, KeyError, OverflowError) as error:
         raise UserError(f"{said}: cannot be read ({error}); {_KINDS}") from error
