@@ -321,6 +321,13 @@ def test_a_texture_that_would_be_lost_is_named(pyramid: Path, tmp_path: Path) ->
     _rejects(pyramid, "a.obj", "a face names vt -9")
 
 
+def test_vertex_colors_little_above_one_are_no_numbers_of_8_bits(tmp_path: Path) -> None:
+    lines = [f"v {x} {y} 0 1.002 0.5 0" for x, y in ((0, 0), (1, 0), (0, 1))]
+    (tmp_path / "a.obj").write_text("\n".join([*lines, "f 1 2 3"]))
+    colors = read_mesh(tmp_path / "a.obj", "a").corner_colors
+    np.testing.assert_allclose(colors, np.tile([1, 0.5, 0], (1, 3, 1)), atol=1e-6)
+
+
 def test_vertex_colors_of_255_are_scaled(tmp_path: Path) -> None:
     lines = [f"v {x} {y} {z} 255 0 51" for x, y, z in ((0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, 1))]
     (tmp_path / "a.obj").write_text("\n".join([*lines, "f 1 2 3", "f 1 2 4", "f 2 3 4"]))
