@@ -343,6 +343,8 @@ def test_a_scene_is_not_gone_on_with_once_what_stands_beside_the_object_has_chan
     shutil.rmtree(begun)
     # a slash behind a folder's name, as shells complete it, is no other folder
     assert generate(out, 4, meshes=f"{meshes}/", **how).rendered == 2
+    summary = generate(out, 1, meshes=meshes, **how)  # fewer than there are
+    assert (summary.frames, summary.rendered, summary.folders) == (4, 0, 2)
 
 
 def test_a_record_from_before_meshes_had_a_scale_goes_on(alone: Path, tmp_path: Path) -> None:

@@ -174,8 +174,9 @@ def generate(
     finally:
         if held:
             release(out)
-    folders = len({job.folder(i) for i in range(frames)})
-    return Summary(out, frames, len(todo), folders, time.perf_counter() - began)
+    there = [path.parent for path in out.glob("mixed/*/[0-9]*.left.json")]  # of earlier runs too
+    seconds = time.perf_counter() - began
+    return Summary(out, len(there), len(todo), len(set(there)), seconds)
 
 
 def list_changed(out: Path, **settings: Any) -> list[str]:
