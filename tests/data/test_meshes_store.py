@@ -48,6 +48,16 @@ def test_all_layouts_are_found(tmp_path: Path) -> None:
     assert store.load("tin").name == "tin"
 
 
+def test_what_a_mac_puts_beside_a_file_is_no_mesh(tmp_path: Path) -> None:
+    for folder in (tmp_path, tmp_path / "mug"):
+        folder.mkdir(exist_ok=True)
+        trimesh.creation.box([0.1, 0.1, 0.1]).export(folder / "box.ply")
+        (folder / "._box.ply").write_bytes(b"Mac OS X")
+    store = MeshStore(tmp_path)
+    assert store.names() == ["box", "mug"]
+    assert len(store.load("mug").faces) == 12
+
+
 def test_unknown_names_say_the_nearest(tmp_path: Path) -> None:
     _box(tmp_path / "003_cracker_box.obj")
     assert "'003_cracker_box'" in _fails(MeshStore(tmp_path), "cracker_box")

@@ -177,7 +177,7 @@ def _find_meshes(root: Path) -> tuple[dict[str, Path], dict[str, str]]:
     files: dict[str, Path] = {}
     ambiguous: dict[str, str] = {}
     try:
-        for entry in sorted(root.iterdir()):
+        for entry in _list_visible(root):
             if not entry.is_dir():
                 if entry.suffix.lower() in SUFFIXES:
                     files.setdefault(entry.stem, entry)
@@ -198,6 +198,11 @@ def _find_meshes(root: Path) -> tuple[dict[str, Path], dict[str, str]]:
     return files, {name: why for name, why in ambiguous.items() if name not in files}
 
 
+def _list_visible(folder: Path) -> list[Path]:
+    """Return what is in a folder, sorted, but hidden files: a Mac puts `._a.obj` beside `a.obj`."""
+    return sorted(entry for entry in folder.iterdir() if not entry.name.startswith("."))
+
+
 def _mesh_in(folder: Path) -> Path | str | None:
     """Return the mesh file of a class's folder, None, or a message where there are several."""
     preferred = [
@@ -207,7 +212,7 @@ def _mesh_in(folder: Path) -> Path | str | None:
     for path in preferred:
         if path.is_file():
             return path
-    others = sorted(p for p in folder.iterdir() if p.suffix.lower() in SUFFIXES)
+    others = [p for p in _list_visible(folder) if p.suffix.lower() in SUFFIXES]
     if len({p.stem for p in others}) > 1:
         return (
             f"{folder}: {len(others)} meshes and none named textured.*: cannot tell "
