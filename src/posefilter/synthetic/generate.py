@@ -236,6 +236,8 @@ def _make_job(given: Mapping[str, Any]) -> Job:
         1.0 if given["mesh_scale"] is None else float(given["mesh_scale"]),
         MotionSettings(moving, shift, turn, int(given["fully_occluded_frames"])),
     )
+
+
 def _plain_folder(meshes: str | Path) -> str:
     """Return a folder without the slash that shells put behind its name."""
     return str(meshes).rstrip("/") or "/"
