@@ -4,6 +4,7 @@ for a user's wish to stop.
 
 import math
 from collections.abc import Sequence
+from numbers import Integral
 from pathlib import Path
 from signal import Signals
 
@@ -40,6 +41,16 @@ def check_range(key: str, value: Sequence[float], least: float = -math.inf) -> t
         above = "" if least == -math.inf else f" above {least:g}"
         raise UserError(f"{key}={list(value)}: must be two numbers{above}, the lower first")
     return float(value[0]), float(value[1])
+
+
+def check_seed(seed: object) -> int:
+    """Return a seed as Python's own number: numpy's overflow.
+
+    Raises UserError unless it is a whole number, 0 or more.
+    """
+    if isinstance(seed, bool) or not isinstance(seed, Integral) or seed < 0:
+        raise UserError(f"seed={seed!r}: must be a whole number, 0 or more")
+    return int(seed)
 
 
 def missing_package(what: str, package: str, extra: str) -> UserError:

@@ -14,7 +14,7 @@ from posefilter.confidence.blank import find_blank
 from posefilter.confidence.tolerance import PoseTolerance
 from posefilter.confidence.verdicts import Costs
 from posefilter.devices import choose_device
-from posefilter.errors import UserError, find_reason
+from posefilter.errors import UserError, check_seed, find_reason
 from posefilter.images import Images, check_images, make_batch
 from posefilter.instances.detect import detect
 from posefilter.instances.pixels import resize_mask
@@ -216,17 +216,6 @@ class Estimator:
 def list_blank(images: Images) -> list[str]:
     """Return of each image why it cannot be judged, "" where it can be."""
     return [find_blank(*one) for one in zip(images.rgb, images.depth, strict=True)]
-
-
-def check_seed(seed: Any) -> int:
-    """Return a seed as Python's own number: numpy's overflow.
-
-    Raises:
-        UserError: It is no whole number, 0 or more.
-    """
-    if isinstance(seed, bool) or not isinstance(seed, Integral) or seed < 0:
-        raise UserError(f"seed={seed!r}: must be a whole number, 0 or more")
-    return int(seed)
 
 
 def count_instances(instances: int | Mapping[str, int], objects: Sequence[str]) -> list[int]:

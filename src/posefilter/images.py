@@ -10,11 +10,10 @@ import torch
 from posefilter.data.readers.plausible import (
     find_center_flaw,
     find_focal_flaw,
-    find_matrix_flaw,
 )
 from posefilter.data.resize import network_size, resize_depth
 from posefilter.errors import UserError
-from posefilter.geometry.camera import resize_intrinsics
+from posefilter.geometry.camera import find_matrix_flaw, resize_intrinsics
 from posefilter.limits import FEWEST_KNOWN, MOST_SIDE
 from posefilter.types import Batch
 

@@ -128,6 +128,10 @@ def test_images_that_cannot_be_resampled_are_refused() -> None:
     rgb, depth = np.zeros((4, 5, 3), np.uint8), np.zeros((4, 5), np.float32)
     with pytest.raises(UserError, match="camera matrix"):
         undistort(rgb, depth, K[0], BROWN)
+    for wrong in (np.transpose(K), np.zeros((3, 3))):  # zeros: ROS, of a camera without calibration
+        for matrices in ((wrong, BROWN), (K, BROWN, False, wrong)):
+            with pytest.raises(UserError, match=r"^intrinsics: are no camera matrix"):
+                undistort(rgb, depth, *matrices)
     with pytest.raises(UserError, match="but rgb"):
         undistort(rgb, depth[:3], K, BROWN)
     with pytest.raises(UserError, match="float16"):

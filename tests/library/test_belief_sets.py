@@ -213,8 +213,44 @@ def test_what_is_no_level_and_no_camera_is_refused() -> None:
     belief = belief_of(draw(50, 0))
     with pytest.raises(UserError, match="quantile q is between 0 and 1"):
         belief.marginal("x").quantile([0.1, 0.5])  # type: ignore[arg-type]
-    with pytest.raises(UserError, match=r"intrinsics: have shape \(4, 4\); expected \(3, 3\)"):
+    with pytest.raises(UserError, match="level is between 0 and 1, and 90 is not"):
+        belief.marginal("x").interval(90)
+    with pytest.raises(UserError, match="level is between 0 and 1"):
+        belief.marginal("x").interval(-0.5)
+    with pytest.raises(UserError, match=r"intrinsics: have shape \(4, 4\)"):
         belief.project(np.eye(4))
+    for wrong, said in ((K.T, "transposed"), (np.nan * K, "NaN"), ("K", "no numbers")):
+        with pytest.raises(UserError, match=rf"^intrinsics: .*{said}"):
+            belief.project(wrong)  # type: ignore[arg-type]
+
+
+def test_what_is_no_point_and_no_pose_is_refused() -> None:
+    belief = belief_of(draw(50, 0))
+    for points in (0.1, [np.nan, 0, 0]):
+        with pytest.raises(UserError, match=r"^points: "):
+            belief.project(K, points)  # type: ignore[arg-type]
+    with pytest.raises(UserError, match=r"^belief: poses should be numbers"):
+        belief.log_density("a")  # type: ignore[arg-type]
+
+
+def test_a_seed_may_be_a_number_of_numpy_and_what_is_none_is_refused() -> None:
+    belief = belief_of(draw(50, 0))
+    np.testing.assert_array_equal(belief.draw(3, np.int64(7)), belief.draw(3, 7))
+    np.testing.assert_array_equal(
+        belief.fuse(belief, 5, np.int32(7)).samples, belief.fuse(belief, 5, 7).samples
+    )
+    for seed in (1.5, -1, None):
+        with pytest.raises(UserError, match=r"^seed=.*: must be a whole number"):
+            belief.draw(3, seed)  # type: ignore[arg-type]
+    with pytest.raises(UserError, match="another Belief, not with None"):
+        belief.fuse(None)  # type: ignore[arg-type]
+
+
+def test_a_belief_stays_what_it_is_where_the_array_that_it_was_made_of_changes() -> None:
+    samples = draw(50, 0)
+    belief = belief_of(samples)
+    samples[:] = np.eye(4)
+    np.testing.assert_array_equal(belief.samples, draw(50, 0))
 
 
 def any_turn(steps: int = 36) -> np.ndarray:

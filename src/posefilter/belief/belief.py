@@ -22,8 +22,9 @@ from posefilter.belief.summaries import (
     measure_uncertainty,
     project_belief,
 )
-from posefilter.errors import UserError
+from posefilter.errors import UserError, check_seed
 from posefilter.filters.modes import APART, Modes, find_pose_modes
+from posefilter.geometry.camera import check_camera_matrix
 from posefilter.geometry.pose import is_rigid, make_pose, origin_of
 from posefilter.geometry.pose_density import (
     PoseDensity,
@@ -322,15 +323,16 @@ class Belief:
             level: Share of the weight within the radius.
 
         Raises:
-            UserError: The intrinsics or points have another shape, or the level is not in [0, 1].
+            UserError: The intrinsics are no camera matrix, the points have another shape or are not
+                finite, or the level is not in [0, 1].
         """
-        at = self.center if points is None else np.asarray(points, dtype=np.float64)
-        if at.ndim > 2 or at.shape[-1] != 3:
+        at = self.center if points is None else _as_numbers("points", points)
+        if at.ndim not in (1, 2) or at.shape[-1] != 3:
             raise UserError(f"points: have shape {at.shape}; expected (P, 3)")
+        if not np.isfinite(at).all():
+            raise UserError("points: hold NaN or infinity")
         at = np.atleast_2d(at)
-        K = torch.from_numpy(np.asarray(intrinsics, dtype=np.float64))
-        if K.shape != (3, 3):
-            raise UserError(f"intrinsics: have shape {tuple(K.shape)}; expected (3, 3)")
+        K = torch.from_numpy(check_camera_matrix(intrinsics))
         return project_belief(*self._tensors, torch.from_numpy(at), K, level)
 
     def transform(self, frame_from_camera: np.ndarray) -> "Belief":
@@ -364,11 +366,11 @@ class Belief:
             (count, 4, 4) camera_from_object [m], float64.
 
         Raises:
-            UserError: The count is no whole number, 1 or more.
+            UserError: The count is no whole number, 1 or more, or the seed none, 0 or more.
         """
         if not isinstance(count, int | np.integer) or isinstance(count, bool) or count < 1:
             raise UserError(f"belief: draws {count} poses; expected a whole number, 1 or more")
-        generator = torch.Generator().manual_seed(seed)
+        generator = torch.Generator().manual_seed(check_seed(seed) % (1 << 63))
         return draw_poses(self._density, int(count), generator).numpy()
 
     def fuse(self, other: "Belief", count: int = 500, seed: int = 0) -> "Belief":
@@ -392,8 +394,11 @@ class Belief:
             object are in one place.
 
         Raises:
-            UserError: It is another object's, or the count is no whole number, 1 or more.
+            UserError: It is no belief, or another object's; or as of `draw`.
         """
+        if not isinstance(other, Belief):
+            raise UserError(f"belief: is fused with another Belief, not with {other!r:.50}")
+        seed = check_seed(seed)
         own, theirs = (
             np.concatenate([one.center, [one.radius, one.diameter], one.symmetries.ravel()])
             for one in (self, other)
@@ -486,9 +491,9 @@ class Belief:
 
 
 def _as_numbers(name: str, value: Any) -> np.ndarray:
-    """Return what a belief holds under a name as float64."""
+    """Return numbers as a float64 array of its own, which stays what it is if theirs changes."""
     try:
-        return np.ascontiguousarray(value, dtype=np.float64)
+        return np.array(value, dtype=np.float64, order="C")
     except (TypeError, ValueError) as error:
         raise UserError(f"belief: {name} should be numbers in an array ({error})") from error
 
@@ -503,7 +508,7 @@ def _as_pose(pose: np.ndarray) -> np.ndarray:
 
 def _as_poses(poses: np.ndarray) -> np.ndarray:
     """Return poses (*, 4, 4) or (*, 3, 4) as float64 (*, 4, 4)."""
-    given = np.asarray(poses, dtype=np.float64)
+    given = _as_numbers("poses", poses)
     if given.shape[-2:] == (3, 4):
         top = torch.from_numpy(given)
         given = make_pose(top[..., :3], top[..., 3]).numpy()

@@ -73,7 +73,12 @@ class Marginal:
         return find_quantile(self.values, self.weights, q)
 
     def interval(self, level: float = 0.95) -> tuple[float, float]:
-        """Return the central interval that holds `level` of the weight."""
+        """Return the central interval that holds `level` of the weight.
+
+        Raises:
+            UserError: The level is not in [0, 1].
+        """
+        check_probability("level", level)
         rest = (1 - level) / 2
         return self.quantile(rest), self.quantile(1 - rest)
 

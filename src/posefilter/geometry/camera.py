@@ -3,13 +3,48 @@
 Axes: x right, y down, z forward (OpenCV).  A pixel's center has integer coordinates (u, v).
 """
 
+from typing import Any
+
+import numpy as np
 import torch
 from torch import Tensor
+
+from posefilter.errors import UserError
+
+_SKEW = 0.003  # in focal lengths: it is not used, and moves points by less than a pixel then
 
 
 def intrinsics(fx: float, fy: float, cx: float, cy: float) -> Tensor:
     """Return the camera matrix [px].  -> (3, 3)."""
     return torch.tensor([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+
+
+def find_matrix_flaw(K: np.ndarray) -> str:
+    """Return why finite intrinsics (3, 3) [px] are no pinhole camera's, "" where they are."""
+    if not np.allclose(K[2], [0, 0, 1], atol=1e-6):
+        hint = "transposed?" if np.allclose(K[:, 2], [0, 0, 1], atol=1e-6) else "not [0, 0, 1]"
+        return f"last row {K[2].tolist()}: {hint}"
+    if min(K[0, 0], K[1, 1]) <= 0 or abs(K[1, 0]) > 1e-6 * K[1, 1]:
+        return f"fx {K[0, 0]:g}, fy {K[1, 1]:g} [px]"
+    return f"skew {K[0, 1]:g} px" if abs(K[0, 1]) > _SKEW * K[0, 0] else ""
+
+
+def check_camera_matrix(intrinsics: Any) -> np.ndarray:
+    """Return a camera matrix as float64 (3, 3) [px].
+
+    Raises:
+        UserError: It is none.
+    """
+    try:
+        K = np.asarray(intrinsics, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise UserError(f"intrinsics: are no numbers ({error})") from error
+    if K.shape != (3, 3):
+        raise UserError(f"intrinsics: have shape {K.shape}; expected a camera matrix (3, 3)")
+    flaw = find_matrix_flaw(K) if np.isfinite(K).all() else "they hold NaN or infinity"
+    if flaw:
+        raise UserError(f"intrinsics: are no camera matrix ({flaw})")
+    return K
 
 
 def project(points: Tensor, K: Tensor) -> Tensor:

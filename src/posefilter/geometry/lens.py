@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 
 from posefilter.errors import UserError
+from posefilter.geometry.camera import check_camera_matrix
 
 _COUNTS = (4, 5, 8, 12, 14)  # of coefficients that OpenCV's model takes
 _COUNT_FISHEYE = 4
@@ -42,14 +43,16 @@ def undistort(
         Color and depth, of the same shapes and types.
 
     Raises:
-        UserError: There are not as many coefficients, or they are no numbers; or the shapes differ,
-            or a type cannot be resampled.
+        UserError: There are not as many coefficients, or they are no numbers; or intrinsics are no
+            camera matrix; or the shapes differ, or a type cannot be resampled.
     """
     height, width = depth.shape[:2]
     if rgb.shape[:2] != (height, width):
         raise UserError(f"depth: has shape {depth.shape}, but rgb {rgb.shape}")
-    K = _read_matrix(intrinsics)
-    wanted = K if new_intrinsics is None else _read_matrix(new_intrinsics)
+    K, wanted = (
+        tuple(check_camera_matrix(one).ravel().tolist())
+        for one in (intrinsics, intrinsics if new_intrinsics is None else new_intrinsics)
+    )
     maps = _find_maps(K, wanted, read_distortion(distortion, fisheye), fisheye, width, height)
     color, z = (np.ascontiguousarray(one) for one in (rgb, depth))
     try:
@@ -82,14 +85,6 @@ def read_distortion(numbers: Any, fisheye: bool = False) -> tuple[float, ...]:
             f"{'k1 to k4' if fisheye else 'k1,k2,p1,p2[,k3[,k4,k5,k6...]]'}"
         )
     return tuple(array.tolist())
-
-
-def _read_matrix(intrinsics: Any) -> tuple[float, ...]:
-    """Return the nine numbers of a camera matrix."""
-    matrix = np.asarray(intrinsics, dtype=np.float64)
-    if matrix.shape != (3, 3):
-        raise UserError(f"intrinsics: have shape {matrix.shape}; expected a camera matrix (3, 3)")
-    return tuple(matrix.ravel().tolist())
 
 
 @lru_cache(maxsize=4)  # a video's frames have the same

@@ -6,8 +6,8 @@ from typing import Any
 import numpy as np
 import torch
 
-from posefilter.errors import UserError
-from posefilter.estimator import Estimator, check_seed, get_trained_size
+from posefilter.errors import UserError, check_seed
+from posefilter.estimator import Estimator, get_trained_size
 from posefilter.images import (
     Images,
     as_array,

@@ -7,12 +7,12 @@ import numpy as np
 
 from posefilter.data.frames import Implausible, Sample
 from posefilter.errors import BadData
+from posefilter.geometry.camera import find_matrix_flaw
 
 FARTHEST = 100.0  # [m] of an object, and of the median of what a depth image holds
 _NEAREST = 0.01  # [m] of that median
 _FOCAL = (0.1, 100.0)  # focal lengths, in widths of the image: 157 to 0.6 degrees of view
 _SQUARE = 2.0  # the focal lengths of one camera differ by this factor at most
-_SKEW = 0.003  # in focal lengths: it is not used, and moves points by less than a pixel then
 _UNITS = (1e-2, 1e7)  # depth image units a meter
 
 
@@ -32,16 +32,6 @@ def check_camera(K: np.ndarray, path: Path) -> None:
     flaw = find_matrix_flaw(K)
     if flaw:
         raise BadData(path, "intrinsics are no camera matrix", flaw)
-
-
-def find_matrix_flaw(K: np.ndarray) -> str:
-    """Return why finite intrinsics (3, 3) [px] are no pinhole camera's, "" where they are."""
-    if not np.allclose(K[2], [0, 0, 1], atol=1e-6):
-        hint = "transposed?" if np.allclose(K[:, 2], [0, 0, 1], atol=1e-6) else "not [0, 0, 1]"
-        return f"last row {K[2].tolist()}: {hint}"
-    if min(K[0, 0], K[1, 1]) <= 0 or abs(K[1, 0]) > 1e-6 * K[1, 1]:
-        return f"fx {K[0, 0]:g}, fy {K[1, 1]:g} [px]"
-    return f"skew {K[0, 1]:g} px" if abs(K[0, 1]) > _SKEW * K[0, 0] else ""
 
 
 def find_focal_flaw(K: np.ndarray, width: int) -> str:
