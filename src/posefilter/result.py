@@ -108,7 +108,7 @@ class Result:
         None where there is no probability.  Of an image that cannot be judged (`blank`) always
         "unsure".  `decide` takes other costs, and another tolerance.
         """
-        return self.decide(self.costs, self.pose_tolerance)
+        return self.decide(self.costs)
 
     def decide(
         self, costs: Costs, pose_tolerance: PoseTolerance | None = None, prior: float = 0.5
@@ -117,7 +117,7 @@ class Result:
 
         Args:
             costs: What errors cost.
-            pose_tolerance: What a right pose is; None: an ADD below 0.1 diameters.
+            pose_tolerance: What a right pose is; None: what `verdict` goes by.
             prior: Share of the images that show the object, in (0, 1); `presence` and `probability`
                 are of one half. See `posefilter.confidence.verdicts.apply_prior`.
 
@@ -128,7 +128,10 @@ class Result:
             return "unsure"
         if self.presence is None:
             return None
-        known = self.presence, self.probability_within(pose_tolerance or RIGHT)
+        known = (
+            self.presence,
+            self.probability_within(pose_tolerance or self.pose_tolerance or RIGHT),
+        )
         verdict = decide(*(known if prior == 0.5 else apply_prior(*known, prior)), costs)
         return "unsure" if verdict == "found" and self.wrong_size else verdict
 

@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -16,11 +17,13 @@ from posefilter.confidence.tolerance import (
     measure_pose_errors,
     read_pose_tolerance,
 )
+from posefilter.confidence.verdicts import Costs, apply_prior
 from posefilter.errors import UserError
 from posefilter.geometry.pose import make_pose
 from posefilter.geometry.rotation import exp_so3
 from posefilter.meshes.symmetries import rotation_about, symmetry_group
 from posefilter.metrics.confidence import calibration_error
+from posefilter.result import Result
 from posefilter.types import ObjectModel
 
 NAMES = ("a", "b")
@@ -122,9 +125,27 @@ def test_numbers_must_be_positive_and_one_given() -> None:
     assert read_pose_tolerance({"add": None, "add_s": 0.1}) == PoseTolerance(add_s=0.1)
     with pytest.raises(UserError, match="gives none of translation_mm"):
         PoseTolerance()
+    assert PoseTolerance(rotation_deg=np.float32(5)) == PoseTolerance(rotation_deg=5)
+    assert Costs(miss=np.int64(2), unsure=np.float32(1)) == Costs(miss=2)
+    assert apply_prior(0.5, 0.4, np.float32(0.25))[0] == 0.25  # type: ignore[arg-type]
     for wrong in (0, -1, math.inf, math.nan, True, "5"):
         with pytest.raises(UserError, match=r"pose_tolerance\.rotation_deg="):
             PoseTolerance(rotation_deg=wrong)  # type: ignore[arg-type]
+
+
+def test_another_cost_is_judged_by_the_same_tolerance_unless_another_is_given() -> None:
+    own = PoseTolerance(translation_mm=5)
+    result = SimpleNamespace(
+        blank="",
+        presence=0.95,
+        wrong_size=False,
+        pose_tolerance=own,
+        probability_within=lambda tolerance: 0.9 if tolerance == RIGHT else 0.3,
+    )
+    assert Result.decide(result, Costs()) == "unsure"  # type: ignore[arg-type]
+    assert Result.decide(result, Costs(), RIGHT) == "found"  # type: ignore[arg-type]
+    result.pose_tolerance = None
+    assert Result.decide(result, Costs()) == "found"  # type: ignore[arg-type]
 
 
 def test_all_that_is_given_must_be_kept_and_is_said() -> None:

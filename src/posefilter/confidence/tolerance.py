@@ -6,6 +6,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields
 from functools import reduce
+from numbers import Real
 from operator import and_
 from typing import Any, NamedTuple
 
@@ -55,7 +56,7 @@ class PoseTolerance:
         """Check the numbers."""
         given = {key: value for key, value in asdict(self).items() if value is not None}
         for key, value in given.items():
-            number = isinstance(value, int | float) and not isinstance(value, bool)
+            number = isinstance(value, Real) and not isinstance(value, bool)
             if not (number and 0 < value < math.inf):
                 raise UserError(f"pose_tolerance.{key}={value}: must be a positive number")
         if not given:

@@ -9,6 +9,7 @@ References:
 
 import math
 from dataclasses import dataclass, fields
+from numbers import Real
 from typing import Literal
 
 import torch
@@ -41,7 +42,7 @@ class Costs:
         """Check that the costs are positive."""
         for field in fields(self):
             value = getattr(self, field.name)
-            number = isinstance(value, int | float) and not isinstance(value, bool)
+            number = isinstance(value, Real) and not isinstance(value, bool)
             if not (number and 0 < value < math.inf):
                 raise UserError(f"cost_{field.name}={value}: must be a positive number")
 
@@ -89,7 +90,7 @@ def apply_prior(presence: float, probability: float, prior: float) -> tuple[floa
     Raises:
         UserError: The prior is not between 0 and 1.
     """
-    number = isinstance(prior, int | float) and not isinstance(prior, bool)
+    number = isinstance(prior, Real) and not isinstance(prior, bool)
     if not (number and 0 < prior < 1):
         raise UserError(f"prior={prior}: must lie between 0 and 1, ends excluded")
     there, absent = prior * presence, (1 - prior) * (1 - presence)
