@@ -23,6 +23,11 @@ METHOD = """
 from posefilter.models.patch_pf import PatchPF
 class OwnScore(PatchPF):
     pass
+class OwnLabel(PatchPF):
+    def __init__(self, label, **base):
+        super().__init__(**base)
+def own_loss(trace, batch, object_model):
+    pass
 class Misspelt:
     requires = ("pixelspace",)
 class Text:
@@ -68,6 +73,31 @@ def test_a_class_that_is_not_there_is_told_before_what_does_not_fit(
     own, there = target.startswith("ownpf"), "imported" in TARGETS[target][0]
     renamed = own and scope is Scope.RECIPE and not there
     assert ("was it renamed after the checkpoint?" in str(told.value)) is renamed
+
+
+@pytest.mark.parametrize(
+    ("node", "told"),
+    [
+        ({"_target_": "ownpf.method.OwnLabel"}, "loss.label: is missing, and has no default"),
+        (
+            {"_target_": "ownpf.method.own_loss"},
+            "loss.trace: is missing, and has no default; where it is to be called later, add "
+            "`_partial_: true`",
+        ),
+        (
+            {"_target_": "posefilter.losses.likelihood.Bce", "label": {"size": 1}},
+            "loss.label: has no _target_, and must be a Label",
+        ),
+    ],
+)
+def test_a_setting_that_is_left_out_of_a_file_is_told(
+    node: dict[str, object], told: str, package: Path
+) -> None:
+    with pytest.raises(UserError) as refused:
+        instantiate(node, "loss")
+    assert str(refused.value) == told
+    made = instantiate({"_target_": "ownpf.method.own_loss", "_partial_": True}, "loss")
+    assert made(None, None, None) is None
 
 
 def test_a_draft_that_is_not_chosen_is_left_out(

@@ -206,14 +206,23 @@ def check_arguments(
             raise UserError(f"{where}.{name}: {label} takes no such setting{hint(name, known)}")
     for name, value in arguments.items():
         if name in known and not fits(value, known[name].annotation):
-            raise UserError(f"{where}.{name}={value!r}: must be {describe(known[name].annotation)}")
-    later = where.rpartition(".")[2] in _CALLED_LATER
-    # others' parents may be given what the child works out
-    if partial or not (later or target.__module__.startswith("posefilter.")):
+            wanted = describe(known[name].annotation)
+            if isinstance(value, Mapping):
+                raise UserError(f"{where}.{name}: has no _target_, and must be {wanted}")
+            raise UserError(f"{where}.{name}={value!r}: must be {wanted}")
+    if partial:
         return
+    call, later = "", where.rpartition(".")[2] in _CALLED_LATER
+    if later:
+        call = "; it is called later: add `_partial_: true`"
+    elif inspect.isfunction(target):
+        call = "; where it is to be called later, add `_partial_: true`"
+    if not (later or target.__module__.startswith("posefilter.")):
+        # others' parents may be given what the child works out
+        own = inspect.signature(target).parameters
+        known = {name: parameter for name, parameter in known.items() if name in own}
     for name, parameter in known.items():
         if parameter.default is parameter.empty and name not in arguments and name not in given:
-            call = "; it is called later: add `_partial_: true`" if later else ""
             raise UserError(f"{where}.{name}: is missing, and has no default{call}")
 
 
