@@ -18,7 +18,9 @@ from posefilter.data.augmentation import (
     RandomErasing,
     RollAndZoom,
 )
-from posefilter.data.frames import Sample
+from posefilter.data.cache import MemoryCache
+from posefilter.data.dataset import FrameDataset
+from posefilter.data.frames import FrameRecord, Sample
 from posefilter.errors import UserError
 
 
@@ -178,6 +180,30 @@ def test_noise_leaves_holes_alone_and_stays_small() -> None:
     assert (out.depth[5:9, 5:20] == 0).all()
     known = x.depth > 0
     assert 0 < np.abs(out.depth[known] - x.depth[known]).max() < 0.05
+
+
+FLAWS = {
+    "returned a NoneType, not a posefilter": lambda x: None,
+    "rgb is float": lambda x: dataclasses.replace(x, rgb=x.rgb / 255),
+    "rgb is uint8 .*channels first": lambda x: dataclasses.replace(x, rgb=x.rgb.transpose(2, 0, 1)),
+    "mask is bool": lambda x: dataclasses.replace(x, mask=x.mask[:5]),
+    "camera_from_object holds NaN": lambda x: dataclasses.replace(
+        x, camera_from_object=np.nan * x.camera_from_object
+    ),
+    "depth is negative": lambda x: dataclasses.replace(x, depth=x.depth - 9),
+}
+
+
+@pytest.mark.parametrize("told", FLAWS)
+def test_what_no_sample_can_be_is_refused(told: str) -> None:
+    """Colors of 0 to 1 would be divided by 255 again, and learned as black."""
+    cache, record = MemoryCache(), FrameRecord("a/0", "a", 0, 0, 1, "square", 0, ())
+    cache.keep(record, sample())
+    made = FrameDataset([record], cache, lambda x, draw, rng: FLAWS[told](x))
+    with pytest.raises(UserError, match=rf"^data\.augment: {told}"):
+        made[0]
+    same = FrameDataset([record], cache, lambda x, draw, rng: x)
+    assert same[0].rgb.max() > 0.5
 
 
 def test_color_keeps_the_geometry_and_the_same_seed_the_same_image() -> None:

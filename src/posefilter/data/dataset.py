@@ -15,6 +15,7 @@ from torch.utils.data import DataLoader, Dataset, Sampler
 
 from posefilter.data.cache import FrameCache
 from posefilter.data.frames import FrameRecord, Sample
+from posefilter.data.readers.checked import check_augmented
 from posefilter.errors import UserError
 from posefilter.types import Batch
 
@@ -63,7 +64,7 @@ class FrameDataset(Dataset[Batch]):
         sample = self.sample(i)
         if self._augment is not None:
             rng = np.random.default_rng([self._seed, int(self._epoch), i])
-            sample = self._augment(sample, self._draw, rng)
+            sample = check_augmented(self._augment(sample, self._draw, rng), sample)
         return to_batch(sample)
 
     def sample(self, i: int) -> Sample:

@@ -1,20 +1,22 @@
-"""Whether a reader keeps to its protocol: what it lists, and what it reads.
+"""Whether readers and augmentations keep to their protocols: what a reader lists, and the samples
+of both.
 
-A reader of a plug-in is its author's work: one mistake of it, such as depth in millimeters, would
-else be learned without a word.
+One of a plug-in is its author's work: one mistake of it, such as depth in millimeters, would else
+be learned without a word.
 """
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import torch
 
 from posefilter.data.frames import FrameRecord, Implausible, Sample
 from posefilter.data.readers.base import BaseReader
-from posefilter.data.readers.plausible import FARTHEST, find_matrix_flaw
+from posefilter.data.readers.plausible import FARTHEST
 from posefilter.errors import BadData, UserError
+from posefilter.geometry.camera import find_matrix_flaw
 from posefilter.geometry.pose import is_rigid
 
 _RIGID = 5e-3  # of a rotation's entries; datasets round them
@@ -74,6 +76,21 @@ def read_checked(reader: BaseReader, i: int, record: FrameRecord) -> Sample:
     if unit:
         raise Implausible(file, cause, detail, sample)
     raise BadData(file, cause, detail)
+
+
+def check_augmented(sample: Any, before: Sample) -> Sample:
+    """Return what an augmentation has made of a sample.
+
+    Raises:
+        UserError: It is no `Sample`, or has other types, shapes or numbers than one has: colors of
+            0 to 1 would else be learned as black.
+    """
+    wrong = _find_type_flaw(sample, before.object_id + 1)
+    if not wrong and (flaw := _find_number_flaw(sample)) is not None:
+        wrong = f"{flaw[0]} ({flaw[1]})"
+    if wrong:
+        raise UserError(f"data.augment: {wrong}")
+    return cast(Sample, sample)
 
 
 def _find_type_flaw(sample: Any, objects: int) -> str:
