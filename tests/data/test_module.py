@@ -6,6 +6,7 @@ import subprocess
 import sys
 import textwrap
 from functools import partial
+from pathlib import Path
 from types import SimpleNamespace
 
 import cv2
@@ -27,13 +28,48 @@ from dataset_trees import (
 from torch.utils.data import default_collate
 
 from posefilter.data.augmentation import PasteOccluder, RandomCrop
-from posefilter.data.dataset import EpochShuffle
-from posefilter.data.loaders import spare_cores
+from posefilter.data.dataset import EpochShuffle, FrameDataset
+from posefilter.data.loaders import make_loader, spare_cores
 from posefilter.data.module import PoseDataModule
-from posefilter.errors import UserError
+from posefilter.errors import BadData, UserError
 from posefilter.geometry.camera import resize_intrinsics
 from posefilter.meshes.store import MeshStore
 from posefilter.types import Batch
+
+
+class Refusing(FrameDataset):
+    """Two frames that cannot be read."""
+
+    def __init__(self, error: Exception) -> None:
+        self.error = error
+
+    def __len__(self) -> int:
+        return 2
+
+    def sizes(self) -> dict:
+        return {}
+
+    def __getitem__(self, i: int) -> Batch:
+        raise self.error
+
+
+@pytest.mark.parametrize(
+    ("error", "told"),
+    [
+        (UserError("a.npy: changed while it was in use"), "a.npy: changed while it was in use"),
+        (BadData(Path("a.png"), "is cut", "12 bytes"), "a.png: is cut (12 bytes)"),
+        (FileNotFoundError(2, "No such file", "a.npy"), "[Errno 2] No such file: 'a.npy'"),
+    ],
+)
+def test_a_mistake_in_a_loaders_process_is_told_in_one_line(error: Exception, told: str) -> None:
+    with pytest.raises(UserError) as caught:
+        next(iter(make_loader(Refusing(error), 1, 1)))
+    assert str(caught.value) == told
+
+
+def test_another_error_there_keeps_its_traceback() -> None:
+    with pytest.raises(RuntimeError, match=r"(?s)^Caught RuntimeError in .*__getitem__"):
+        next(iter(make_loader(Refusing(RuntimeError("mine")), 1, 1)))
 
 
 @pytest.fixture(scope="module")

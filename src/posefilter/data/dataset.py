@@ -171,9 +171,15 @@ class ResumableLoader(DataLoader[Batch]):
             self.sampler.skip(start * int(self.batch_size or 1))
             self._given = start
         _ITERATED.add(self)
-        for batch in super().__iter__():
-            self._given += 1
-            yield batch
+        try:
+            for batch in super().__iter__():
+                self._given += 1
+                yield batch
+        except (UserError, OSError, RuntimeError) as error:
+            told = _find_told_in_worker(error)
+            if not told:
+                raise
+            raise UserError(told) from error
 
     def state_dict(self) -> dict[str, int]:
         """Return how far the epoch is."""
@@ -182,6 +188,18 @@ class ResumableLoader(DataLoader[Batch]):
     def load_state_dict(self, state: dict[str, int]) -> None:
         """Go on from there; after a whole epoch, from the start of the next."""
         self._start = state["given"] % max(self.batches or len(self), 1)
+
+
+def _find_told_in_worker(error: Exception) -> str:
+    """Return what a mistake in a loader's process said, "" for other errors.
+
+    Torch hands its traceback on as a message, by a RuntimeError where it cannot make such an error.
+    """
+    lines = str(error).splitlines() or [""]
+    if not (lines[0].startswith("Caught ") and "worker process" in lines[0]):
+        return ""
+    kind, _, told = lines[-1].partition(": ")
+    return told if not isinstance(error, RuntimeError) or kind.startswith("posefilter.") else ""
 
 
 _ITERATED: WeakSet[ResumableLoader] = WeakSet()
