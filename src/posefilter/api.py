@@ -65,23 +65,28 @@ def load(
     Raises:
         UserError: A file is missing or holds no checkpoint, or an override does not fit it.
     """
-    check_overrides(overrides)
+    overrides = check_overrides(overrides)
     wanted = changes(compose(overrides, "predict")) if overrides else {}
     return Estimator(methods_of(weights, wanted), device, costs, pose_tolerance)
 
 
-def check_overrides(overrides: Sequence[str]) -> None:
-    """Refuse what changes nothing of a trained filter.
+def _list_overrides(overrides: Iterable[str], example: str) -> list[str]:
+    """Return settings, of a generator too, as a list; raises UserError where one is no text."""
+    listed = isinstance(overrides, Iterable) and not isinstance(overrides, str | Mapping)
+    found = [*overrides] if listed else []
+    if not listed or not all(isinstance(one, str) for one in found):
+        raise UserError(f"overrides={overrides!r}: must be a list, such as ['{example}']")
+    return found
+
+
+def check_overrides(overrides: Iterable[str]) -> list[str]:
+    """Return what is to be changed of a trained filter.
 
     Raises:
         UserError: They are no list of texts, or one sets what is not the filter's.
     """
-    listed = isinstance(overrides, Iterable) and not isinstance(overrides, str | Mapping)
-    if not listed or not all(isinstance(one, str) for one in overrides):
-        raise UserError(
-            f"overrides={overrides!r}: must be a list, such as ['filter.particles=1000']"
-        )
-    for one in overrides:
+    found = _list_overrides(overrides, "filter.particles=1000")
+    for one in found:
         key = one.lstrip("+~").split("=")[0].split("@")[0]
         if not key.startswith(tuple(f"{section}{mark}" for section in SECTIONS for mark in "./")):
             instead = f": {_INSTEAD[key]}" if key in _INSTEAD else ""
@@ -89,6 +94,7 @@ def check_overrides(overrides: Sequence[str]) -> None:
                 f"overrides: '{one}' changes nothing of a trained filter{instead}; what does "
                 "begins with filter or model, such as filter.particles=1000 or filter/refine=none"
             )
+    return found
 
 
 def compose(overrides: Sequence[str] = (), command: str = "train") -> DictConfig:
@@ -104,14 +110,13 @@ def compose(overrides: Sequence[str] = (), command: str = "train") -> DictConfig
         The configuration; `folder` is missing in it, since no run has begun.
 
     Raises:
-        UserError: An override names what there is not, or a choice of a training that does not fit
-            the others.
+        UserError: An override names what there is not, a choice of a training that does not fit
+            the others, or a plug-in that is not trusted: see `trust`.
     """
-    if isinstance(overrides, str | Mapping) or not all(isinstance(one, str) for one in overrides):
-        raise UserError(f"overrides={overrides!r}: must be a list, such as ['model=patch_pf']")
+    found = _list_overrides(overrides, "model=patch_pf")
     from posefilter.cli.command import compose_config  # Hydra: `load` answers without it
 
-    return compose_config(command, [*overrides])
+    return compose_config(command, found)
 
 
 def build(config: DictConfig, data: "PoseDataModule | None" = None) -> PoseEstimator:

@@ -230,6 +230,19 @@ def test_so_it_does_on_the_command_line(
     assert " own " in capfd.readouterr().out
 
 
+def test_a_file_that_cannot_be_read_is_named_with_its_line(
+    with_choices: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    file = with_choices / "conf" / "loss" / "own.yaml"
+    file.write_text("_target_: ownpf.method.own_loss\n  label: 1\n")
+    told = f"{file.resolve()}, line 2: cannot be read as YAML (mapping values"
+    with pytest.raises(UserError) as refused:
+        posefilter.compose(["loss=own"])
+    assert str(refused.value).startswith(told)
+    assert run_command("train", HOME, ["plugins=[ownpf]", "loss=own"]) == 2
+    assert f"train: {told}" in capfd.readouterr().err
+
+
 def test_an_installed_plug_in_that_cannot_be_used_is_warned_of(
     with_choices: Path, entry_point: None, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:

@@ -28,6 +28,19 @@ def test_what_is_no_list_of_settings_is_told(given: Any) -> None:
         posefilter.compose(given)
 
 
+def test_settings_may_come_from_a_generator() -> None:
+    config = posefilter.compose(one for one in ["model=patch_pf"])  # type: ignore[arg-type]
+    assert config.model["_target_"].endswith("PatchPF")
+    with pytest.raises(posefilter.UserError, match="changes nothing of a trained filter"):
+        posefilter.load("003_cracker_box", overrides=(one for one in ["seed=1"]))  # type: ignore[arg-type]
+
+
+def test_a_plug_in_is_trusted_by_a_call_and_not_by_a_setting() -> None:
+    told = r"^plugins=ownpf: in Python call posefilter\.trust\('ownpf'\) instead$"
+    with pytest.raises(posefilter.UserError, match=told):
+        posefilter.compose(["plugins=[ownpf]", "loss=own"])
+
+
 @pytest.mark.parametrize("given", [None, {"data": {}}, [], OmegaConf.create({"seed": 0})])
 def test_what_is_no_configuration_is_told(given: Any) -> None:
     for build in (posefilter.build, posefilter.build_data):

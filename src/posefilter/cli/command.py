@@ -14,6 +14,7 @@ from hydra.core.global_hydra import GlobalHydra
 from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf, open_dict
 from omegaconf.errors import OmegaConfBaseException
+from yaml import YAMLError
 
 from posefilter.cli.ablation_configs import register_ablations
 from posefilter.cli.arguments import (
@@ -42,7 +43,7 @@ from posefilter.cli.replaced import replace_typed
 from posefilter.cli.resume import keep_record, with_resumed
 from posefilter.cli.running import EXPECTED, import_plugin, run_job
 from posefilter.cli.search_path import add_plugin_folders
-from posefilter.cli.trust import Scope, find_folders, trust
+from posefilter.cli.trust import Scope, find_folders, trust, trusted
 from posefilter.cli.usage import describe_command
 from posefilter.errors import (
     FAILURE,
@@ -192,6 +193,11 @@ def compose_config(name: str, overrides: list[str]) -> DictConfig:
     conf = find_conf()
     if not (conf / f"{name}.yaml").is_file():
         raise UserError(f"command={name}: there is none; choose {', '.join(COMMANDS)}")
+    for package in typed_plugins(overrides):
+        if package not in trusted():
+            raise UserError(
+                f"plugins={package}: in Python call posefilter.trust('{package}') instead"
+            )
     try:
         check_choices(overrides, conf, name)
         check_added(overrides, conf, name)
@@ -199,5 +205,5 @@ def compose_config(name: str, overrides: list[str]) -> DictConfig:
         if name == "train":
             check_fit(job.cfg, job.choices, Scope.CONFIG)
         return job.cfg
-    except (HydraException, OmegaConfBaseException) as error:
+    except (HydraException, OmegaConfBaseException, YAMLError) as error:
         raise UserError(explain(error, name, conf, overrides)) from error

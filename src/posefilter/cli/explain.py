@@ -16,6 +16,7 @@ from hydra.errors import (
 )
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
+from yaml import MarkedYAMLError
 
 from posefilter.cli.arguments import quote
 from posefilter.cli.choices import config_folders, list_choices
@@ -49,6 +50,8 @@ def explain(error: BaseException, name: str, conf: Path, arguments: list[str]) -
     if isinstance(error, OSError) and error.strerror:
         place = "a file" if error.filename is None else str(error.filename)
         return f"{place}: cannot be read or written ({error.strerror})"
+    if isinstance(error, MarkedYAMLError):
+        return _explain_yaml(error)
     if isinstance(error, MemoryError):
         return "out of memory: fewer particles, smaller batches or images take less"
     if (
@@ -101,6 +104,13 @@ def explain(error: BaseException, name: str, conf: Path, arguments: list[str]) -
     return first_line(error)
 
 
+def _explain_yaml(error: MarkedYAMLError) -> str:
+    """Return which file of settings cannot be read, and where."""
+    mark = error.problem_mark
+    place = "the settings" if mark is None else f"{mark.name}, line {mark.line + 1}"
+    return f"{place}: cannot be read as YAML ({error.problem})"
+
+
 def _tell_quotes(argument: str) -> str:
     """Return how an argument is typed whose value is one text, with signs that Hydra reads."""
     key, found, value = argument.partition("=")
@@ -115,6 +125,8 @@ def _tell_quotes(argument: str) -> str:
 
 def explain_hydra(error: BaseException, conf: Path, arguments: list[str]) -> str:
     """Return in one line what Hydra's own code, or a launcher or sweeper of it, stumbled over."""
+    if isinstance(error, MarkedYAMLError):
+        return _explain_yaml(error)
     frames = traceback.extract_tb(error.__traceback__)
     if any("hydra_plugins" in Path(frame.filename).parts for frame in frames):
         chosen = [a for a in arguments if a.startswith(("hydra/launcher=", "hydra/sweeper="))]
