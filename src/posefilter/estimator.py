@@ -11,8 +11,8 @@ import torch
 from omegaconf import OmegaConf
 
 from posefilter.confidence.blank import find_blank
-from posefilter.confidence.tolerance import PoseTolerance
-from posefilter.confidence.verdicts import Costs
+from posefilter.confidence.tolerance import PoseTolerance, check_pose_tolerance
+from posefilter.confidence.verdicts import Costs, check_costs
 from posefilter.devices import choose_device
 from posefilter.errors import UserError, check_seed, find_reason
 from posefilter.images import Images, check_images, make_batch
@@ -62,12 +62,8 @@ class Estimator:
         except (RuntimeError, AssertionError) as error:  # torch's, of devices that are not there
             why = find_reason(error)
             raise UserError(f"device={device}: cannot be used ({why})") from error
-        if not isinstance(costs, Costs | None):
-            raise UserError(f"costs={costs!r}: expected posefilter.Costs(...)")
-        if not isinstance(pose_tolerance, PoseTolerance | None):
-            raise UserError(
-                f"pose_tolerance={pose_tolerance!r}: expected posefilter.PoseTolerance(...)"
-            )
+        check_costs(costs)
+        check_pose_tolerance(pose_tolerance)
         self.costs, self.pose_tolerance = costs or Costs(), pose_tolerance
         for method in self.methods:
             if pose_tolerance is not None and method.calibration is not None:

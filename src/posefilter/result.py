@@ -13,11 +13,12 @@ from posefilter.belief.summaries import check_probability
 from posefilter.confidence.apparent_size import ApparentSize
 from posefilter.confidence.calibration import Assessment, Calibration
 from posefilter.confidence.conformal import Conformal
-from posefilter.confidence.tolerance import RIGHT, PoseTolerance
+from posefilter.confidence.tolerance import RIGHT, PoseTolerance, check_pose_tolerance
 from posefilter.confidence.verdicts import (
     Costs,
     Verdict,
     apply_prior,
+    check_costs,
     decide,
     describe_probability,
 )
@@ -124,6 +125,8 @@ class Result:
         Raises:
             UserError: As of `probability_within`; or the prior is not between 0 and 1.
         """
+        check_costs(costs)
+        check_pose_tolerance(pose_tolerance)
         if self.blank:
             return "unsure"
         if self.presence is None:
@@ -151,7 +154,8 @@ class Result:
             UserError: There is no probability, or the checkpoint was calibrated by an earlier
                 version, which knows of no other tolerance than an ADD below 0.1 diameters.
         """
-        if pose_tolerance == RIGHT and self.probability is not None:
+        check_pose_tolerance(pose_tolerance)
+        if pose_tolerance in (None, RIGHT) and self.probability is not None:
             return self.probability
         if self.calibration is None or not self.features:
             why = self.calibration_note or "the image cannot be judged"

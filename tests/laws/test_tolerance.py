@@ -144,6 +144,9 @@ def test_another_cost_is_judged_by_the_same_tolerance_unless_another_is_given() 
     )
     assert Result.decide(result, Costs()) == "unsure"  # type: ignore[arg-type]
     assert Result.decide(result, Costs(), RIGHT) == "found"  # type: ignore[arg-type]
+    for wrong in ((5,), (Costs(), 0.05)):
+        with pytest.raises(UserError, match=r"expected posefilter\.(Costs|PoseTolerance)\("):
+            Result.decide(result, *wrong)
     result.pose_tolerance = None
     assert Result.decide(result, Costs()) == "found"  # type: ignore[arg-type]
 

@@ -89,6 +89,12 @@ class PoseTolerance:
 RIGHT = PoseTolerance(add=0.1)  # what `probability` is of
 
 
+def check_pose_tolerance(given: object) -> None:
+    """Raise UserError unless a tolerance is one, or None."""
+    if not isinstance(given, PoseTolerance | None):
+        raise UserError(f"pose_tolerance={given!r}: expected posefilter.PoseTolerance(...)")
+
+
 def read_pose_tolerance(given: Mapping[str, Any] | None) -> PoseTolerance | None:
     """Return the tolerance of a configuration; None where all of it is null."""
     if given is None or all(value is None for value in given.values()):

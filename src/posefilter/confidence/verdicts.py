@@ -47,6 +47,12 @@ class Costs:
                 raise UserError(f"cost_{field.name}={value}: must be a positive number")
 
 
+def check_costs(given: object) -> None:
+    """Raise UserError unless costs are `Costs`, or None."""
+    if not isinstance(given, Costs | None):
+        raise UserError(f"costs={given!r}: expected posefilter.Costs(...)")
+
+
 def decide(presence: float, probability: float, costs: Costs | None = None) -> Verdict:
     """Return the verdict of least expected cost.
 
