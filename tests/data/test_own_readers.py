@@ -17,7 +17,7 @@ from posefilter.data.module import PoseDataModule
 from posefilter.data.readers.base import BaseReader
 from posefilter.data.readers.checked import index_records, read_checked
 from posefilter.data.readers.fat import FatReader
-from posefilter.data.readers.registry import READERS
+from posefilter.data.readers.registry import READERS, register_reader
 from posefilter.errors import UserError
 from posefilter.meshes.store import MeshStore
 
@@ -202,6 +202,23 @@ def test_the_check_of_a_dataset_tells_too(root: Path, monkeypatch: pytest.Monkey
     monkeypatch.setattr(OwnReader, "change", staticmethod(TYPES["alpha"][0]))
     with pytest.raises(UserError, match=r"OwnReader\.read, frame s0/0: rgb is uint8"):
         check_dataset(reader, meshes)
+
+
+def test_a_class_that_is_defined_again_takes_its_own_place_and_no_other(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def define() -> type[BaseReader]:
+        class Mine(OwnReader):
+            pass
+
+        return Mine
+
+    monkeypatch.setitem(READERS, "mine", define())
+    again = define()
+    register_reader("mine", again)
+    assert READERS["mine"] is again
+    with pytest.raises(UserError, match=r"data.source=fat: a reader .* exists, .*\.FatReader$"):
+        register_reader("fat", OwnReader)
 
 
 def test_what_a_builtin_reader_reads_passes(tmp_path: Path) -> None:

@@ -34,9 +34,19 @@ def register_reader(source: str, reader: Callable[..., BaseReader]) -> None:
     Raises:
         UserError: Another reader has the name.
     """
-    if READERS.get(source, reader) is not reader:
-        raise UserError(f"data.source={source}: a reader of this name already exists")
+    known = READERS.get(source, reader)
+    # a class that is defined again, as in a notebook, takes the place of the one before
+    again = isinstance(known, type) and _find_home(known) == _find_home(reader)
+    if known is not reader and not again:
+        raise UserError(
+            f"data.source={source}: a reader of this name already exists, {_find_home(known)}"
+        )
     READERS[source] = reader
+
+
+def _find_home(reader: Callable[..., BaseReader]) -> str:
+    """Return the module and the name of a reader's class or function."""
+    return f"{reader.__module__}.{getattr(reader, '__qualname__', '')}"
 
 
 def open_reader(
