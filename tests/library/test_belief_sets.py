@@ -80,6 +80,13 @@ def test_a_wider_belief_has_a_higher_entropy_by_the_logarithm_of_its_volume() ->
     assert narrow.differential_entropy == pytest.approx(exact, abs=0.6)
 
 
+def test_sets_and_marginals_are_shown_in_a_line() -> None:
+    belief = belief_of(draw(50, 0))
+    for one in (belief.credible_set(0.9), belief.marginal("z")):
+        assert "\n" not in repr(one)
+        assert len(repr(one)) < 80
+
+
 def test_density_has_the_shape_of_what_is_asked() -> None:
     belief = belief_of(draw(60, 3))
     asked = draw(6, 4).reshape(2, 3, 4, 4)

@@ -1,7 +1,7 @@
 """Sets of poses that hold a truth with a stated probability: regions of highest density."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -23,9 +23,9 @@ class PoseSet:
 
     coverage: float
     min_log_density: float
-    samples: np.ndarray
-    weights: np.ndarray
-    log_density: Callable[[np.ndarray], np.ndarray]
+    samples: np.ndarray = field(repr=False)
+    weights: np.ndarray = field(repr=False)
+    log_density: Callable[[np.ndarray], np.ndarray] = field(repr=False)
 
     @property
     def level(self) -> float:

@@ -1,7 +1,7 @@
 """What a belief comes to, in few numbers: axis by axis, in words, and in the image."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from numbers import Real
 
 import numpy as np
@@ -46,8 +46,8 @@ class Marginal:
     """
 
     axis: str
-    values: np.ndarray
-    weights: np.ndarray
+    values: np.ndarray = field(repr=False)
+    weights: np.ndarray = field(repr=False)
 
     @property
     def mean(self) -> float:
