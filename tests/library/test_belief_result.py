@@ -226,6 +226,9 @@ def test_a_belief_of_single_precision_is_one_of_double() -> None:
         ({"center": np.array([0.0, np.nan, 0.0])}, "the center should be three numbers"),
         ({"radius": 0.0}, "the radius should be above 0, and is 0.0"),
         ({"diameter": np.nan}, "the diameter should be above 0, and is nan"),
+        ({"diameter": None}, "the diameter should be above 0, and is nan"),
+        ({"radius": "0.1 m"}, "the radius should be numbers"),
+        ({"draws": 0.5}, "0.5 of its 1 samples cannot be draws"),
         ({"samples": [["a"]]}, "samples should be numbers in an array"),
     ],
 )

@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
+from numbers import Integral
 from pathlib import Path
 from typing import Any
 
@@ -102,13 +103,13 @@ class Belief:
             raise UserError("belief: the symmetries should be rigid transforms")
         if self.center.shape != (3,) or not np.isfinite(self.center).all():
             raise UserError(f"belief: the center should be three numbers, not {self.center}")
-        if not 0 <= self.draws <= count:
+        if not isinstance(self.draws, Integral) or not 0 <= self.draws <= count:
             raise UserError(f"belief: {self.draws} of its {count} samples cannot be draws")
         for name in ("radius", "diameter"):
-            if not 0 < getattr(self, name) < np.inf:
-                raise UserError(
-                    f"belief: the {name} should be above 0, and is {getattr(self, name)}"
-                )
+            size = _as_numbers(f"the {name}", getattr(self, name))
+            if size.ndim or not 0 < size < np.inf:
+                raise UserError(f"belief: the {name} should be above 0, and is {size}")
+            object.__setattr__(self, name, float(size))
 
     def __repr__(self) -> str:
         about = f"{len(self.weights)} particles {self.uncertainty().describe()}"
