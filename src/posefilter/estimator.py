@@ -54,7 +54,7 @@ class Estimator:
         for method in methods:
             if "pose" not in method.capabilities:
                 raise UserError(f"{type(method).__name__} detects, and estimates no pose")
-        device = device or choose_device()
+        device = choose_device() if device is None else device
         if str(device).split(":")[0] not in ("cpu", "cuda"):
             raise UserError(f"device={device}: choose cpu, cuda or cuda:N; others have no float64")
         try:

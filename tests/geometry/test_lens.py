@@ -138,6 +138,12 @@ def test_images_that_cannot_be_resampled_are_refused() -> None:
         undistort(rgb, depth.astype(np.float16), K, BROWN)
 
 
+def test_masked_depth_stays_unknown() -> None:
+    depth = np.ma.masked_greater(np.where(np.eye(40) > 0, 9.0, 0.7), 5)
+    z = undistort(np.zeros((40, 40, 3), np.uint8), depth, np.diag([40.0, 40, 1]), [0.0] * 5)[1]
+    assert set(np.unique(z)) == {0, 0.7}
+
+
 @pytest.mark.parametrize("count", [4, 5, 8, 12, 14])
 def test_what_no_pixel_shows_is_empty(count: int) -> None:
     rgb, depth = np.full((240, 320, 3), 200, np.uint8), np.full((240, 320), 0.7, np.float32)

@@ -22,5 +22,6 @@ def test_a_device_that_fails_without_a_message_is_refused() -> None:
     method: Any = SimpleNamespace(capabilities={"pose"}, to=fail)
     with pytest.raises(UserError, match=r"^device=cuda: cannot be used \(AssertionError\)$"):
         Estimator([method], device="cuda")
-    with pytest.raises(UserError, match=r"^device=mps: choose cpu, cuda or cuda:N"):
-        Estimator([method], device="mps")
+    for device in ("mps", 0, ""):  # 0 is a GPU to torch, and no wish for whatever there is
+        with pytest.raises(UserError, match=rf"^device={device}: choose cpu, cuda or cuda:N"):
+            Estimator([method], device=device)  # type: ignore[arg-type]

@@ -54,7 +54,8 @@ def undistort(
         for one in (intrinsics, intrinsics if new_intrinsics is None else new_intrinsics)
     )
     maps = _find_maps(K, wanted, read_distortion(distortion, fisheye), fisheye, width, height)
-    color, z = (np.ascontiguousarray(one) for one in (rgb, depth))
+    # masked depth is unknown
+    color, z = (np.ascontiguousarray(np.ma.filled(one, 0)) for one in (rgb, depth))
     try:
         return (
             cv2.remap(color, *maps, cv2.INTER_LINEAR),
