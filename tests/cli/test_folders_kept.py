@@ -9,6 +9,7 @@ from omegaconf import OmegaConf
 from posefilter.cli import run_command
 from posefilter.cli.evaluate import keep_training_results
 from posefilter.cli.folders import KeepResults, move_evaluation, own_metrics
+from posefilter.cli.predict import remove_answers
 from posefilter.errors import UserError
 
 HOME = Path(__file__).parents[2]
@@ -161,3 +162,19 @@ def test_a_run_with_another_inside_is_resumed(tmp_path: Path) -> None:
     config.resume = None
     with pytest.raises(UserError, match="holds a run already"):
         KeepResults()._check_run(config)
+
+
+def test_of_an_answer_before_nothing_is_left(tmp_path: Path) -> None:
+    alone = ("pose.json", "belief.png", "belief.npz", "band.png", "view.rrd")
+    several = ("poses.json", "poses.csv", "beliefs/00_a.npz", "beliefs/13_b.npz")
+    others = ("overlay.png", "photo.png")
+    (tmp_path / "beliefs").mkdir()
+    for name in (*alone, *several, *others):
+        (tmp_path / name).touch()
+    remove_answers(tmp_path)
+    assert sorted(file.name for file in tmp_path.iterdir()) == sorted(others)
+    for name in ("poses.csv", "view.rrd"):  # of an evaluation or a track: there is no answer
+        (tmp_path / name).touch()
+    remove_answers(tmp_path)
+    assert (tmp_path / "poses.csv").exists()
+    assert (tmp_path / "view.rrd").exists()

@@ -3,6 +3,7 @@
 import math
 import shlex
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -36,6 +37,9 @@ from posefilter.result import Result, collect_results
 from posefilter.weights import expand_weights, is_several
 
 VIEW = "view.rrd"
+# what an answer consists of, but for the overlay, which each writes anew; the first is a mark of it
+_ALONE = ("pose.json", "belief.png", "belief.npz", "band.png", VIEW)
+_SEVERAL = ("poses.json", "poses.csv", "beliefs/[0-9][0-9]_*.npz")
 _FRAME = (
     "OpenCV camera (x right, y down, z ahead), the object as in its mesh file; camera_from_object "
     "in meters"
@@ -84,11 +88,10 @@ def predict_one(job: Job) -> list[Result]:
     (run,) = estimator.run(images, cfg.seed)
     ((result,),) = collect_results([run], costs, tolerance)
     folder.mkdir(parents=True, exist_ok=True)
+    remove_answers(folder)
     save_image(result.draw_overlay(rgb, K, shape), folder / "overlay.png")
     band = folder / "band.png"
-    if result.verdict == "absent":
-        band.unlink(missing_ok=True)  # of an earlier answer
-    else:
+    if result.verdict != "absent":
         save_image(result.draw_band(rgb, K, shape), band)
     save_image(result.draw_belief(rgb, K), folder / "belief.png")
     belief_file = folder / "belief.npz"
@@ -104,7 +107,7 @@ def predict_one(job: Job) -> list[Result]:
         print_result(result)
     files = {"pose": folder / "pose.json", "overlay": folder / "overlay.png"}
     files |= {"belief": folder / "belief.png", "numbers": belief_file}
-    files |= {"band": band} if band.is_file() else {}
+    files |= {"band": band} if result.verdict != "absent" else {}
     files |= {"view": folder / VIEW} if cfg.save_rerun else {}
     following = [f"rerun {shlex.quote(str(folder / VIEW))}"] if cfg.save_rerun else []
     ended(cfg.console, "predicted", files, following, **answer)
@@ -128,6 +131,7 @@ def predict_several(job: Job) -> list[Result]:
     seen = [one for one in results if one.verdict != "absent"]
     absent = [name for name in estimator.objects if name not in {one.object for one in seen}]
     drawn = [mark_result(one, load_shape(store, one.object_model)) for one in seen]
+    remove_answers(folder)
     beliefs = folder / "beliefs"
     beliefs.mkdir(parents=True, exist_ok=True)
     save_image(draw_detections(rgb, K, drawn, absent), folder / "overlay.png")
@@ -152,6 +156,16 @@ def predict_several(job: Job) -> list[Result]:
     files |= {"overlay": folder / "overlay.png", "beliefs": beliefs}
     ended(cfg.console, "predicted", files, [], poses=answers)
     return results
+
+
+def remove_answers(folder: Path) -> None:
+    """Remove the files of an earlier answer: those that a new one lacks would pass for its own."""
+    for mark, *others in (_ALONE, _SEVERAL):
+        if (folder / mark).is_file():  # files of these names alone may be another command's
+            for file in [one for name in (*others, mark) for one in folder.glob(name)]:
+                file.unlink()
+    with suppress(OSError):  # is not there, or not empty
+        (folder / "beliefs").rmdir()
 
 
 def list_rows(results: Sequence[Result], objects: Sequence[str]) -> list[PoseRow]:
