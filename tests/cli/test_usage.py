@@ -62,6 +62,15 @@ def test_only_what_a_command_has_is_listed() -> None:
     assert "model" not in shown.split()
 
 
+def test_what_is_right_and_what_an_error_does_can_be_told() -> None:
+    for name in ("predict", "evaluate"):
+        assert "pose_tolerance.add_s" in describe_command(name, CONF)
+    for name in ("track", "convert_bag"):
+        shown = " ".join(describe_command(name, CONF).split())
+        assert "on_error=raise raise ends at a" in shown
+        assert "skip leaves it out" in shown
+
+
 def test_a_folder_of_ones_own_adds_its_choices(tmp_path: Path) -> None:
     (tmp_path / "loss").mkdir()
     (tmp_path / "loss" / "brier.yaml").write_text("_target_: mine.Brier\n")

@@ -26,6 +26,9 @@ _INDENT, _NARROWEST, _WIDEST = 26, 60, 120
 _MEANINGS = {
     "variant": "(paper: as published; working: with this project's modifications, which work)"
 }
+_TOLERANCE = {
+    "pose_tolerance.add_s": "largest ADD-S of a right pose; or .add, .translation_mm, .rotation_deg"
+}
 # the settings that are typed most, of sections that the chosen files fill
 _SECTIONS = {
     "train": {
@@ -39,8 +42,12 @@ _SECTIONS = {
         "data.root": "folder of the dataset",
         "data.meshes": "builtin, or a folder of meshes",
         "filter.particles": "number of particles; filter.steps: number of filter steps",
+        **_TOLERANCE,
     },
-    "predict": {"filter.particles": "number of particles; filter.steps: number of filter steps"},
+    "predict": {
+        "filter.particles": "number of particles; filter.steps: number of filter steps",
+        **_TOLERANCE,
+    },
     "track": {
         "data.root": "folder of the dataset, where data= is given",
         "tracker.motion.translation_mm": "how far an object may move between two frames",
