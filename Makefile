@@ -57,7 +57,7 @@ tables: $(STAMP) ## write the tables of docs/ from docs/results/runs.csv
 
 docs: $(STAMP) ## build the site with the reference into outputs/site
 	$(PY) -m pip install --quiet --disable-pip-version-check --editable '.[docs]'
-	NO_MKDOCS_2_WARNING=1 $(VENV)/bin/mkdocs build --quiet
+	NO_MKDOCS_2_WARNING=1 $(VENV)/bin/mkdocs build
 
 board: $(STAMP) ## show every run in TensorBoard
 	$(VENV)/bin/tensorboard --logdir outputs
