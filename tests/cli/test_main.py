@@ -34,6 +34,9 @@ REFUSED = {
     "predict": "checkpoint: is missing",
     "predict checkpoint=003_cracker_box": "rgb: is missing",
     "predict checkpoint=003_cracker_box rgb=a.png depth=b.png intrinsics=1,1,1,1": "rgb=a.png: no",
+    "predict checkpoint=003_cracker_box rgb=. depth=. intrinsics=1,1,1,1": "rgb=.: is a folder; "
+    "predict takes one image, and track frames=DIR a folder of them",
+    "evaluate estimates=.": "estimates=.: is a folder",
     "track": "checkpoint: is missing",
     "track checkpoint=003_cracker_box frames=nowhere intrinsics=1,1,1,1": "frames=nowhere: no such",
     "track checkpoint=[003_cracker_box,nowhere.ckpt]": "checkpoint=nowhere.ckpt: no such file",
@@ -207,3 +210,12 @@ def test_a_tolerance_without_a_probability_is_refused(
     ]
     assert run_command("evaluate", HOME, typed) == MISTAKE
     assert "pose_tolerance: is of a checkpoint's probability" in capfd.readouterr().err
+
+
+def test_of_a_changed_filter_it_is_said_why_there_is_no_probability(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    typed = ["checkpoint=003_cracker_box", "filter.particles=50", "pose_tolerance.add=0.2"]
+    assert run_command("evaluate", HOME, [*typed, f"out={tmp_path / 'o'}"]) == MISTAKE
+    (line,) = capfd.readouterr().err.splitlines()
+    assert line.endswith("to be within one: the checkpoint was calibrated for another filter")

@@ -88,8 +88,8 @@ def _of_checkpoint(job: Job) -> tuple[dict[str, Any], dict[str, Path]]:
     tolerance = read_pose_tolerance(job.cfg.pose_tolerance)
     if tolerance is not None and method.calibration is None:
         raise UserError(
-            f"pose_tolerance: checkpoint={job.cfg.checkpoint} is not calibrated, so that it has no "
-            "probability to be within one; calibrate.py calibrates it"
+            f"pose_tolerance: checkpoint={job.cfg.checkpoint} has no probability to be within one: "
+            f"{method.calibration_note}"
         )
     method.pose_tolerance = tolerance or RIGHT
     if method.calibration is not None:

@@ -23,6 +23,8 @@ _FOLDERS = {
     "track": ("frames", "meshes", "data.root", "data.meshes"),
     "train": ("data.root", "data.meshes"),
 }
+_ONE_IMAGE = "is a folder; predict takes one image, and track frames=DIR a folder of them"
+_IS_FOLDER = {"rgb": _ONE_IMAGE, "depth": _ONE_IMAGE, "estimates": "is a folder; name a file in it"}
 _SWITCHES = {"calibrate": ("overwrite",), "convert_bag": ("rectify", "track", "copy_messages")}
 # by the class of a logger: the package that it needs, which is an extra of ours by the same name
 _LOGGERS = {
@@ -83,7 +85,8 @@ def check_files(command: str, cfg: DictConfig) -> None:
         _take_as_text(cfg, key)
     for key in _FILES.get(command, ()):
         if cfg[key] is not None and not Path(str(cfg[key])).is_file():
-            raise UserError(f"{key}={cfg[key]}: no such file")
+            is_folder = Path(str(cfg[key])).is_dir()
+            raise UserError(f"{key}={cfg[key]}: {_IS_FOLDER[key] if is_folder else 'no such file'}")
     for key in _FOLDERS.get(command, ()):
         folder = find(cfg, key)
         if folder is None or folder == "builtin" or Path(str(folder)).is_dir():
