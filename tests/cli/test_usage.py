@@ -69,6 +69,7 @@ def test_what_is_right_and_what_an_error_does_can_be_told() -> None:
         shown = " ".join(describe_command(name, CONF).split())
         assert "on_error=raise raise ends at a" in shown
         assert "skip leaves it out" in shown
+    assert "least standard deviation of a frame's motion" in describe_command("track", CONF)
 
 
 def test_a_folder_of_ones_own_adds_its_choices(tmp_path: Path) -> None:

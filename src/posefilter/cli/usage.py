@@ -50,9 +50,9 @@ _SECTIONS = {
     },
     "track": {
         "data.root": "folder of the dataset, where data= is given",
-        "tracker.motion.translation_mm": "how far an object may move between two frames",
+        "tracker.motion.translation_mm": "least standard deviation of a frame's motion",
         "tracker.follow.pixels": "image points of a pose; cost is in proportion",
-        "tracker.smoothing_noise": "smoothing over time [m]",
+        "tracker.smoothing_noise": "standard deviation of one frame's estimate [m]",
     },
     "check_data": {"data.root": "folder of the dataset"},
 }
