@@ -2,8 +2,11 @@
 
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 
+from posefilter.cli.predict import mark_result
+from posefilter.confidence.tolerance import PoseTolerance
 from posefilter.result import Result
 
 
@@ -41,6 +44,22 @@ def answer(verdict: str | None, **more: object) -> SimpleNamespace:
 def test_an_image_that_cannot_be_judged_is_told_also_without_a_probability() -> None:
     said = Result.describe(answer("unsure", blank="black", probability=None))  # type: ignore[arg-type]
     assert said == "box: unsure, the image cannot be judged"
+
+
+def mark(one: SimpleNamespace) -> tuple[str, str]:
+    given = {"pose": np.eye(4), "warnings": (), "probability_within": lambda tolerance: 0.3}
+    drawn = mark_result(SimpleNamespace(**{**given, **vars(one)}), None)  # type: ignore[arg-type]
+    return drawn.label, drawn.tag
+
+
+def test_among_several_a_score_is_not_taken_for_a_probability() -> None:
+    assert mark(answer(None, probability=None)) == ("box (score 1.5)", "")
+    assert mark(answer("found")) == ("box (0.90)", "box 0.90")
+
+
+def test_among_several_the_probability_is_that_of_the_tolerance_that_was_given() -> None:
+    own = answer("unsure", pose_tolerance=PoseTolerance(translation_mm=1))
+    assert mark(own) == ("box (unsure 0.30, there 0.95)", "box 0.30")
 
 
 @pytest.mark.parametrize("verdict", ["found", "unsure", "absent"])

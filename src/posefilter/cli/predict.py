@@ -190,9 +190,11 @@ def mark_result(result: Result, shape: Shape) -> Drawn:
     """Return how a result is drawn among several: its line, its tag, its name in the legend."""
     unsure = result.verdict == "unsure"
     if result.probability is None or result.presence is None:
-        said, tag = f"{result.score:.1f}", ""
+        said, tag = f"score {result.score:.1f}", ""
     else:
-        said = describe_probability(result.probability)
+        asked = result.pose_tolerance  # which the verdict goes by
+        right = result.probability if asked is None else result.probability_within(asked)
+        said = describe_probability(right)
         tag = f"{result.object} {said}"
         if unsure:
             said = f"unsure {said}, there {describe_probability(result.presence)}"
