@@ -36,7 +36,8 @@ def find_weights(weights: str | Path | None) -> Path:
     """
     if weights is None or not str(weights):
         raise UserError(
-            "checkpoint: is missing; give checkpoint=RUN/checkpoints/best.ckpt, or one of weights/"
+            "checkpoint: is missing; give checkpoint=RUN/checkpoints/best.ckpt, or a name such as "
+            "003_cracker_box"
         )
     if not isinstance(weights, str | os.PathLike):
         raise UserError(f"checkpoint={weights}: must be a file, a run's folder or a name")

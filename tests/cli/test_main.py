@@ -37,7 +37,7 @@ REFUSED = {
     "predict checkpoint=003_cracker_box rgb=. depth=. intrinsics=1,1,1,1": "rgb=.: is a folder; "
     "predict takes one image, and track frames=DIR a folder of them",
     "evaluate estimates=.": "estimates=.: is a folder",
-    "track": "checkpoint: is missing",
+    "track": "checkpoint: is missing; give checkpoint=RUN/checkpoints/best.ckpt, or a name such as",
     "track checkpoint=003_cracker_box frames=nowhere intrinsics=1,1,1,1": "frames=nowhere: no such",
     "track checkpoint=[003_cracker_box,nowhere.ckpt]": "checkpoint=nowhere.ckpt: no such file",
     "generate meshes=nowhere": "meshes=nowhere: no such folder",

@@ -62,6 +62,11 @@ def test_only_what_a_command_has_is_listed() -> None:
     assert "model" not in shown.split()
 
 
+@pytest.mark.parametrize("name", COMMANDS)
+def test_weights_are_named_as_they_are_found_outside_of_a_clone_too(name: str) -> None:
+    assert "weights/" not in describe_command(name, CONF).replace("out=weights/", "")
+
+
 def test_what_is_right_and_what_an_error_does_can_be_told() -> None:
     for name in ("predict", "evaluate"):
         assert "pose_tolerance.add_s" in describe_command(name, CONF)
