@@ -1,6 +1,7 @@
 """What has been tracked so far, in two files that a killed `track.py` leaves behind."""
 
 import os
+from collections import Counter
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
@@ -50,8 +51,17 @@ class TrackLog:
         self._header = ""
 
     def list_poses(self, rows: Sequence[TrackRow]) -> list[PoseRow]:
-        """Return the rows of the results file: of frames in which the object was tracked."""
-        return [to_pose_row(row, self._native) for row in rows if row.result.is_tracked]
+        """Return the rows of the results file: of frames in which the object was tracked. BOP's
+        time is that of an image, all objects together.
+        """
+        seconds = Counter[tuple[str, str]]()
+        for row in rows:
+            seconds[row.video, row.frame] += row.result.seconds
+        return [
+            to_pose_row(row, self._native)._replace(seconds=seconds[row.video, row.frame])
+            for row in rows
+            if row.result.is_tracked
+        ]
 
     def close(self) -> None:
         """Close the two files, which stay."""
