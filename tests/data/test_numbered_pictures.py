@@ -121,3 +121,28 @@ def test_depth_may_be_tiff_of_floats(tmp_path: Path) -> None:
     cv2.imwrite(str(tmp_path / "depth" / "1.tiff"), np.full((4, 4), 1.5, np.float32))
     (frame,) = FolderVideo(tmp_path, np.eye(3), 1000.0)
     np.testing.assert_array_equal(frame.depth, np.full((4, 4), 1.5, np.float32))
+
+
+def write_frames(folder: Path, sizes: list[tuple[int, int]]) -> None:
+    """Write pictures 0.png, 1.png, ... of these heights and widths."""
+    for name, kind in (("rgb", np.uint8), ("depth", np.uint16)):
+        (folder / name).mkdir()
+        for number, size in enumerate(sizes):
+            cv2.imwrite(str(folder / name / f"{number}.png"), np.full(size, 100, kind))
+
+
+def test_a_frame_of_another_size_than_the_first_is_named(tmp_path: Path) -> None:
+    """The intrinsics are of one size: in a picture of another they would be wrong."""
+    write_frames(tmp_path, [(24, 32), (24, 32), (12, 16)])
+    video = FolderVideo(tmp_path, np.eye(3), 1000.0)
+    assert [video.read(i).rgb.shape for i in range(2)] == [(24, 32, 3)] * 2
+    with pytest.raises(UserError, match=r"2\.png: wrong image size \(16x12, but 0\.png says 32x24"):
+        video.read(2)
+
+
+def test_a_distortion_that_no_lens_has_is_named(tmp_path: Path) -> None:
+    write_frames(tmp_path, [(24, 32)])
+    K = np.array([[32.0, 0, 16], [0, 32, 12], [0, 0, 1]])
+    assert FolderVideo(tmp_path, K, 1000.0, distortion=(0.1, 0, 0, 0)).read(0).depth.any()
+    with pytest.raises(UserError, match=r"^distortion=50,0,0,0: without it, .* % of the depth is"):
+        FolderVideo(tmp_path, K, 1000.0, distortion=(50, 0, 0, 0)).read(0)

@@ -29,7 +29,7 @@ from posefilter.figures.detections import Drawn, draw_detections
 from posefilter.figures.overlay import Shape
 from posefilter.figures.recording import record
 from posefilter.figures.view_data import collect_view_data
-from posefilter.geometry.lens import read_distortion, undistort
+from posefilter.geometry.lens import read_distortion, undistort_most
 from posefilter.images import check_images, drop_unknown
 from posefilter.meshes.ycb import number_objects
 from posefilter.metrics.bop_results import PoseRow, choose_score, write_poses_csv
@@ -48,7 +48,6 @@ _PROBABILITY = (
     "that the object is in the image and the pose within 0.1 diameters (ADD), calibrated on "
     "validation scenes of which half showed the object; presence: that it is in the image"
 )
-_LEFT = 0.5  # of the depth, of images without distortion
 _SURFACE = PoseTolerance(add_s=0.1)
 _CALIBRATED = (
     "where the pose is if the estimate is right (within 0.1 diameters), as wide as the errors of "
@@ -351,14 +350,7 @@ def read_inputs(cfg: DictConfig) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     if camera.size is not None:
         expect_size(Path(cfg.rgb), rgb, *camera.size, f"intrinsics={cfg.intrinsics}")
     if cfg.distortion is not None:
-        before = np.count_nonzero(depth)
-        rgb, depth = undistort(rgb, depth, K, parse_distortion(cfg.distortion))
-        left = np.count_nonzero(depth) / before
-        if left < _LEFT:
-            raise UserError(
-                f"distortion={cfg.distortion}: without it, {100 * left:.1f} % of the depth "
-                "is left; are these the lens's coefficients, in this order?"
-            )
+        rgb, depth = undistort_most(rgb, depth, K, parse_distortion(cfg.distortion))
     return rgb, depth, K
 
 

@@ -15,7 +15,7 @@ from posefilter.data.readers.base import BaseReader
 from posefilter.data.readers.checked import read_checked
 from posefilter.data.readers.decode import expect_size, list_folder, read_color, read_depth
 from posefilter.errors import UserError
-from posefilter.geometry.lens import undistort
+from posefilter.geometry.lens import undistort_most
 
 _TIME = re.compile(r"\d+\.\d+|\d{10,}")
 _COLOR = (".png", ".jpg", ".jpeg", ".bmp", ".webp", ".tif", ".tiff", ".ppm")
@@ -78,8 +78,8 @@ class FolderVideo(Video):
         intrinsics: (3, 3) camera matrix of all frames [px].
         depth_scale: Units of the depth images in a meter.
         stride: Take every so many frames.
-        distortion: Of the lens, see `undistort`; None: the pictures are rectified.
-        size: Height and width that the intrinsics are of [px]; None: that is not known.
+        distortion: Of the lens, see `undistort_most`; None: the pictures are rectified.
+        size: Height and width that the intrinsics are of [px]; None: the first picture's.
         skip: Let color pictures without depth be, where others have some: reading them fails.
 
     Raises:
@@ -100,7 +100,7 @@ class FolderVideo(Video):
         skip: bool = False,
     ) -> None:
         self.name, self._K, self._scale = folder.name, intrinsics, depth_scale
-        self._distortion, self._size = distortion, size
+        self._distortion, self._size, self._sized = distortion, size, "the camera's file"
         self.ids: dict[str, int] = {}
         color, numbers = _list_pictures(folder, "rgb", _COLOR)
         depth, others = _list_pictures(folder, "depth", _DEPTH)
@@ -137,10 +137,11 @@ class FolderVideo(Video):
         number, color, depth = self._frames[index]
         rgb, z = read_color(color), read_depth(depth, self._scale)
         expect_size(depth, z, rgb.shape[0], rgb.shape[1], color.name)
-        if self._size is not None:
-            expect_size(color, rgb, *self._size, "the camera's file")
+        if self._size is None:  # the intrinsics are of one size
+            self._size, self._sized = rgb.shape[:2], color.name
+        expect_size(color, rgb, *self._size, self._sized)
         if self._distortion is not None:
-            rgb, z = undistort(rgb, z, self._K, self._distortion)
+            rgb, z = undistort_most(rgb, z, self._K, self._distortion)
         return VideoFrame(color.stem, number, rgb, z, self._K, {})
 
 

@@ -9,9 +9,11 @@ import numpy as np
 
 from posefilter.errors import UserError
 from posefilter.geometry.camera import check_camera_matrix
+from posefilter.limits import FEWEST_KNOWN
 
 _COUNTS = (4, 5, 8, 12, 14)  # of coefficients that OpenCV's model takes
 _COUNT_FISHEYE = 4
+_LEFT = 0.5  # of the depth, of images without distortion
 
 
 def undistort(
@@ -66,6 +68,26 @@ def undistort(
             f"rgb, depth: types {color.dtype} and {z.dtype} of {width}x{height} pixels cannot be "
             "resampled; uint8 or float32, and uint16 or float32, can"
         ) from error
+
+
+def undistort_most(
+    rgb: np.ndarray, depth: np.ndarray, intrinsics: Any, distortion: Sequence[float]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return color and depth as `undistort` does, where most of the depth is left.
+
+    Raises:
+        UserError: Less than half of it is: no lens distorts so much.
+    """
+    color, z = undistort(rgb, depth, intrinsics, distortion)
+    before = np.count_nonzero(depth)
+    left = np.count_nonzero(z) / max(before, 1)
+    if left < _LEFT and before >= FEWEST_KNOWN * depth.size:  # else it is noise
+        raise UserError(
+            f"distortion={','.join(f'{one:g}' for one in distortion)}: without it, "
+            f"{100 * left:.1f} % of the depth is left; are these the lens's coefficients, in this "
+            "order?"
+        )
+    return color, z
 
 
 def read_distortion(numbers: Any, fisheye: bool = False) -> tuple[float, ...]:
