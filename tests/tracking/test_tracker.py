@@ -310,6 +310,13 @@ def test_later_frames_may_be_covered_and_cameras_be_of_any_kind() -> None:
         tracker.update(RGB, DEPTH, [[1.0, 0.0], [0.0, 1.0, 0.0]])
 
 
+def test_masked_depth_is_unknown_in_every_frame() -> None:
+    tracker = posefilter.Tracker(make_toy()[1])
+    masked = np.ma.MaskedArray(DEPTH, mask=DEPTH < 0.7)
+    depths = [tracker.check(RGB, masked, K).depth for _ in range(2)]
+    assert [np.count_nonzero(z) for z in depths] == [np.count_nonzero(DEPTH >= 0.7)] * 2
+
+
 @pytest.mark.parametrize("patience", [1, 3])
 def test_a_track_loss_detector_counts_frames_in_a_row(patience: int) -> None:
     detector = TrackLossDetector(

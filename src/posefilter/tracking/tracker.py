@@ -148,8 +148,7 @@ class Tracker:
             UserError: The frame is not as it should be.
         """
         fast = (
-            isinstance(rgb, np.ndarray)
-            and isinstance(depth, np.ndarray)
+            type(rgb) is type(depth) is np.ndarray  # a masked array's mask says what is unknown
             and rgb.dtype == np.uint8
             and depth.dtype.kind == "f"
             and rgb.shape == (*depth.shape, 3)
