@@ -97,7 +97,7 @@ def compute_figures(rows: Sequence[TrackRow], object_model: ObjectModel) -> dict
     ]
     absent = [row for row in rows if row.truth is None and row.result.is_tracked]
     out["false_tracks"] = len(wrong) + len(absent)
-    jitters = [measure_row_jitter(run, object_model) for run in _follow_ups(known)]
+    jitters = [measure_row_jitter(run, object_model) for run in _follow_ups(rows)]
     shifts, turns = zip(*jitters, strict=True) if jitters else ((), ())
     out["jitter_mm"], out["jitter_deg"] = _rms(shifts), _rms(turns)
     return out
@@ -111,11 +111,14 @@ def measure_row_jitter(pair: Sequence[TrackRow], object_model: ObjectModel) -> t
 
 
 def _follow_ups(rows: Sequence[TrackRow]) -> list[tuple[TrackRow, TrackRow]]:
-    """Return the pairs of rows, one after the other in a video, in which the object was tracked."""
+    """Return the pairs of rows, one after the other in a video, in which the object was tracked and
+    its true pose is known.
+    """
     return [
         (a, b)
         for a, b in pairwise(rows)
-        if a.video == b.video and a.result.is_tracked and b.result.is_tracked
+        if a.video == b.video
+        and all(row.result.is_tracked and row.truth is not None for row in (a, b))
     ]
 
 

@@ -1,0 +1,30 @@
+"""The figures of a track's rows."""
+
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from tests.tracking.toy import make_toy
+
+from posefilter.tracking.records import TrackRow, compute_figures
+
+
+def make_row(x: float, truth: bool = True, tracked: bool = True) -> TrackRow:
+    """Return a row whose pose is x meters off."""
+    pose = np.eye(4)
+    pose[:3, 3] = x, 0, 1
+    result: Any = SimpleNamespace(
+        is_tracked=tracked, pose=pose, seconds=0.1, status="tracked" if tracked else "lost"
+    )
+    real = np.eye(4)
+    real[2, 3] = 1
+    return TrackRow("v", "1", 0, 1, 1, result, real if truth else None, x, x)
+
+
+def test_jitter_is_of_frames_that_follow_each_other() -> None:
+    """The object left between the second row and the third, and was found anew."""
+    model = make_toy()[0].object_model
+    away = make_row(0.0, truth=False, tracked=False)
+    rows = [make_row(0.0), make_row(0.001), away, make_row(0.009), make_row(0.01)]
+    assert compute_figures(rows, model)["jitter_mm"] == pytest.approx(1)
