@@ -229,11 +229,16 @@ def _name_of_folder(image: str) -> str:
 
 def number_names(names: Sequence[str]) -> list[int] | None:
     """Return the number in each name; None where names do not differ in one number alone."""
-    parts = [re.fullmatch(r"(.*?)(\d+)(\D*)", name) for name in names]
-    found = [(part[1], int(part[2]), part[3]) for part in parts if part is not None]
-    numbers = [number for _, number, _ in found]
-    alike = len({(before, after) for before, _, after in found}) == 1
-    return numbers if alike and len({*numbers}) == len(names) else None
+    parts = [re.split(r"(\d+)", name) for name in names]  # numbers are at odd places
+    if len({len(part) for part in parts}) != 1 or len(parts[0]) == 1:
+        return None
+    columns = [*zip(*parts, strict=True)]
+    differ = [i for i, column in enumerate(columns) if len({*column}) > 1]
+    place = differ[0] if differ else len(columns) - 2  # of one name: its last number
+    if len(differ) > 1 or place % 2 == 0:
+        return None
+    numbers = [int(part) for part in columns[place]]
+    return numbers if len({*numbers}) == len(names) else None
 
 
 def _check_times(folder: Path, color: Sequence[Path], depth: Sequence[Path]) -> None:
