@@ -1,9 +1,12 @@
 """Several objects tracked at once: they share a frame, take turns, and do not change each other."""
 
 import os
+import pickle
 import signal
 import sys
+import time
 from collections.abc import Iterable, Iterator, Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -17,8 +20,9 @@ from posefilter.errors import UserError
 from posefilter.estimator import Estimator
 from posefilter.images import Images
 from posefilter.tracking.frame import Frame
-from posefilter.tracking.processes import share_out
+from posefilter.tracking.processes import WorkerProcess, share_out
 from posefilter.tracking.settings import TrackerSettings
+from posefilter.tracking.worker import Start
 from posefilter.types import Batch
 
 
@@ -172,6 +176,19 @@ def test_a_process_that_cannot_start_is_told(monkeypatch: pytest.MonkeyPatch) ->
         tracker = make_tracker([Here(make_poses()) for _ in range(2)], 2)
     with pytest.raises(UserError, match="could not start"):
         follow(tracker, [0])
+
+
+def test_a_process_that_starts_leaves_ctrl_c_to_the_first_one() -> None:
+    """Importing torch takes it seconds, in which Ctrl-C must not end it with a traceback."""
+    worker = WorkerProcess(pickle.dumps(Start((), 1)), 1)
+    status = Path(f"/proc/{worker._process.pid}/status")
+    ignored = 0
+    while not ignored and not worker.ready:
+        (line,) = [one for one in status.read_text().splitlines() if one.startswith("SigIgn:")]
+        ignored = int(line.split()[1], 16) >> (signal.SIGINT - 1) & 1
+        time.sleep(0.01)
+    assert not worker.ready  # long before it is
+    worker.close()
 
 
 def test_work_is_shared_out_evenly() -> None:

@@ -21,6 +21,12 @@ from posefilter.tracking.track import Track, TrackResult
 from posefilter.tracking.worker import Answer, Start, Task, restore
 
 _MOST_RESTARTS = 10  # of processes that ended
+_PROGRAM = """
+import signal
+signal.signal(signal.SIGINT, signal.SIG_IGN)  # the first process decides what Ctrl-C ends
+from posefilter.tracking.worker import main
+main()
+"""
 
 
 class WorkerProcess:
@@ -35,7 +41,7 @@ class WorkerProcess:
         paths = [path or str(Path.cwd()) for path in sys.path]
         own = {"PYTHONPATH": os.pathsep.join(paths), "OMP_NUM_THREADS": str(threads)}
         self._process = subprocess.Popen(
-            [sys.executable, "-P", "-c", "from posefilter.tracking.worker import main; main()"],
+            [sys.executable, "-P", "-c", _PROGRAM],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=None if _has_stderr() else subprocess.DEVNULL,

@@ -8,7 +8,6 @@ answer it sends the exception that came instead. It ends when its input does.
 
 import os
 import pickle
-import signal
 import sys
 from typing import Any, NamedTuple
 
@@ -61,7 +60,6 @@ def restore(track: Track, answer: Answer) -> TrackResult:
 
 def main() -> None:
     """Answer until the input ends."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the other process decides what Ctrl-C ends
     # what is printed here must not end up between the answers
     answers = os.fdopen(os.dup(sys.stdout.fileno()), "wb")
     os.dup2(sys.stderr.fileno(), sys.stdout.fileno())
