@@ -200,6 +200,21 @@ def test_a_track_has_no_conformal_sets() -> None:
             result.conformal_set(0.9)
 
 
+def test_why_a_lost_object_has_no_probability_is_told() -> None:
+    """Where others are tracked, too, it is not probed for in every frame."""
+    toys = [make_toy() for _ in range(2)]
+    for toy, _ in toys:
+        toy.calibration = Calibration(
+            ("score",), (-5.0,), (2.0,), Logistic((3.0,), 0.0), Logistic((3.0,), 0.0),
+            {"right": 20, "wrong": 0, "absent": 20}, "toy", {},
+        )  # fmt: skip
+    tracker = posefilter.Tracker([estimator for _, estimator in toys])
+    frames = [*[RGB] * 4, BLACK]
+    notes = [tracker.update_all(rgb, DEPTH, K)[1].calibration_note for rgb in frames]
+    rest = "the object is lost, and was not probed for in this frame"
+    assert notes == ["", "", rest, "", "the frame shows nothing"]
+
+
 def test_a_tracks_belief_is_calibrated_where_it_was_measured() -> None:
     toy, estimator = make_toy()
     toy.calibration = Calibration(

@@ -178,12 +178,12 @@ class Track:
         """Return where the object is in the next frame."""
         start = time.perf_counter()
         predicted = None if self.state is None else self._predict(self.state)
-        lost, window = self.loss_detector.lost, None
+        lost, rests, window = self.loss_detector.lost, self._rests, None
         if predicted is not None and not lost:
             window = self._choose_window(frame.images, predicted)
         seen = frame.see_whole(self.size) if window is None else frame.see_window(window)
         batch = Batch(*(x.to(self.method.device) for x in seen))
-        if self._rests or frame.blank or not bool(batch.depth.any()):
+        if rests or frame.blank or not bool(batch.depth.any()):
             sight = FrameEstimate(batch)
         elif predicted is None:
             sight = self._estimate(batch)
@@ -199,6 +199,8 @@ class Track:
         result = make_result(run, 0, self.costs, self.pose_tolerance)
         # the guarantee of conformal sets is of the filter that was calibrated, no track's
         content = {**vars(result), "seconds": time.perf_counter() - start, "conformal": None}
+        if rests and not frame.blank and self.method.calibration is not None:
+            content["calibration_note"] = "the object is lost, and was not probed for in this frame"
         count = 0 if self.state is None else self.state.belief.state.shape[1]
         return TrackResult(**content, status=status, objectness=sight.objectness, particles=count)
 
