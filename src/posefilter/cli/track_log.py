@@ -1,7 +1,7 @@
 """What has been tracked so far, in two files that a killed `track.py` leaves behind."""
 
 import os
-from collections import Counter
+from collections import defaultdict
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
@@ -54,7 +54,7 @@ class TrackLog:
         """Return the rows of the results file: of frames in which the object was tracked. BOP's
         time is that of an image, all objects together.
         """
-        seconds = Counter[tuple[str, str]]()
+        seconds = defaultdict[tuple[str, str], float](float)
         for row in rows:
             seconds[row.video, row.frame] += row.result.seconds
         return [

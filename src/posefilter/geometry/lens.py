@@ -79,7 +79,7 @@ def undistort_most(
         UserError: Less than half of it is: no lens distorts so much.
     """
     color, z = undistort(rgb, depth, intrinsics, distortion)
-    before = np.count_nonzero(depth)
+    before = int(np.count_nonzero(depth))
     left = np.count_nonzero(z) / max(before, 1)
     if left < _LEFT and before >= FEWEST_KNOWN * depth.size:  # else it is noise
         raise UserError(
