@@ -4,6 +4,7 @@ import csv
 import importlib.util
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -398,6 +399,18 @@ def test_a_mistake_is_one_line(
     typed = [one.replace("FOLDER", str(folder)) for one in wrong]
     assert run_command("track", HOME, [*COMMON, *typed, f"out={tmp_path / 'out'}"]) == 2
     assert [told in line for line in capfd.readouterr().err.splitlines()] == [True]
+
+
+def test_two_checkpoints_of_one_object_are_refused(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Their rows and figures would be mixed."""
+    copied = tmp_path / "own.ckpt"
+    shutil.copy(HOME / "weights" / "003_cracker_box.ckpt", copied)
+    typed = [*COMMON[1:], f"checkpoint=[003_cracker_box,{copied}]", f"frames={folder}", CAMERA]
+    assert run_command("track", HOME, [*typed, f"out={tmp_path / 'out'}"]) == 2
+    assert "checkpoint: 2 of them are of 003_cracker_box" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
 
 
 def test_a_folder_has_one_track_at_a_time(

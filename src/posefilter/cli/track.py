@@ -1,6 +1,7 @@
 """Follow objects through videos: poses, figures, and an annotated video."""
 
 import math
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import closing
 from pathlib import Path
@@ -64,6 +65,7 @@ def track(job: Job) -> None:
     threads = torch.get_num_threads()
     settings = make_settings(cfg.tracker)
     estimator = Estimator(methods_of(cfg.checkpoint, changes(cfg)))
+    _check_once(estimator.objects)
     videos, native = open_videos(cfg, estimator.objects)
     store = open_shapes(cfg, estimator.objects)
     shapes = {model.name: load_shape(store, model) for model in estimator.object_models}
@@ -110,6 +112,16 @@ def track(job: Job) -> None:
         raise UserError(f"{broken}; the {count} frames before it are in {folder}") from broken
     if broken is not None:
         raise broken
+
+
+def _check_once(objects: Sequence[str]) -> None:
+    """Raise UserError where two checkpoints are of one object: its name tells tracks apart."""
+    name, count = Counter(objects).most_common(1)[0]
+    if count > 1:
+        raise UserError(
+            f"checkpoint: {count} of them are of {name}; track with one after the other, each with "
+            "an out= of its own"
+        )
 
 
 def follow(
