@@ -386,6 +386,7 @@ def test_a_scene_of_a_dataset_is_tracked_with_its_errors(tmp_path: Path) -> None
         (["frames=FOLDER", CAMERA, "fps=1e-9"], "fps=1e-09: must be a number, at least 0.1"),
         (["frames=FOLDER", CAMERA, "tracker=null"], "tracker=null: track requires a value"),
         (["frames=FOLDER/rgb", CAMERA], "has no folder rgb/"),
+        (["frames=FOLDER/rgb/frame_8.png", CAMERA], "frame_8.png: is a file, and no folder"),
         (["frames=FOLDER", CAMERA, "tracker.patience=0"], "patience=0: must be a whole number"),
         (
             ["frames=FOLDER", CAMERA, "tracker.motion.translation_mm=fast"],

@@ -93,7 +93,8 @@ def check_files(command: str, cfg: DictConfig) -> None:
             continue
         if key == "data.root" and find(cfg, "data.generate") is not None:
             continue  # it is rendered
-        raise UserError(f"{_SHOWN.get(key, key)}={folder}: no such folder")
+        found = "is a file, and no folder" if Path(str(folder)).exists() else "no such folder"
+        raise UserError(f"{_SHOWN.get(key, key)}={folder}: {found}")
 
 
 def _check_bag(cfg: DictConfig) -> None:
