@@ -251,6 +251,7 @@ def test_a_training_that_ends_before_its_first_validation_is_refused(
         max_epochs=-1,
         limit_train_batches=1.0,
         limit_val_batches=1.0,
+        limit_test_batches=1.0,
     )
     run: Any = SimpleNamespace(
         trainer=trainer, data=SimpleNamespace(train_dataloader=lambda: range(4))
@@ -270,6 +271,7 @@ EVERY_SECOND = {"check_val_every_n_epoch": 2, "val_check_interval": 1.0}
     [
         ({"limit_val_batches": 0}, "trainer.limit_val_batches=0: "),
         ({"limit_train_batches": 0.0}, "trainer.limit_train_batches=0: "),
+        ({"limit_test_batches": 0}, "trainer.limit_test_batches=0: "),
         ({"max_epochs": 2}, "trainer.max_epochs=2: 8 batches, and the first validation is"),
         ({"max_epochs": 3}, None),
         ({"max_epochs": 3, "limit_train_batches": 2}, "trainer.max_epochs=3: 6 batches"),
@@ -284,7 +286,9 @@ def test_a_training_without_a_validation_is_refused_before_it_begins(
 ) -> None:
     settings = {"check_val_every_n_epoch": None, "val_check_interval": 10, "max_steps": -1}
     settings |= {"accumulate_grad_batches": 1, "max_epochs": -1}
-    settings |= {"limit_train_batches": 1.0, "limit_val_batches": 1.0}
+    settings |= dict.fromkeys(
+        ("limit_train_batches", "limit_val_batches", "limit_test_batches"), 1.0
+    )
     trainer = SimpleNamespace(**{**settings, **changed})
     data = SimpleNamespace(train_dataloader=lambda: range(4))
     run: Any = SimpleNamespace(trainer=trainer, data=data)

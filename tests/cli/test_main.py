@@ -80,6 +80,8 @@ def test_commands_are_listed(capsys: pytest.CaptureFixture[str]) -> None:
         assert [line.split()[0] for line in lines[1:]] == list(COMMANDS)
     assert main(["--version"]) == 0
     assert capsys.readouterr().out == f"posefilter {posefilter.__version__}\n"
+    assert main(["predict", "--version"]) == 0  # and not Hydra's
+    assert capsys.readouterr().out == f"posefilter {posefilter.__version__}\n"
 
 
 @pytest.mark.parametrize(

@@ -46,3 +46,8 @@ def test_what_is_no_configuration_is_told(given: Any) -> None:
     for build in (posefilter.build, posefilter.build_data):
         with pytest.raises(posefilter.UserError, match=r"^config: .*posefilter\.compose returns"):
             build(given)
+
+
+def test_a_number_outside_of_its_range_is_told_as_by_a_command() -> None:
+    with pytest.raises(posefilter.UserError, match=r"filter\.particles=-5: must be"):
+        posefilter.compose(["filter.particles=-5"])

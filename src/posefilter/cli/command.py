@@ -37,7 +37,8 @@ from posefilter.cli.console import logging_for
 from posefilter.cli.explain import explain, explain_hydra, is_launchers
 from posefilter.cli.fit import check_fit
 from posefilter.cli.job import Job, first, plain_name, run_of
-from posefilter.cli.main import COMMANDS
+from posefilter.cli.main import COMMANDS, describe_version
+from posefilter.cli.plain import to_plain
 from posefilter.cli.ranks import STARTED
 from posefilter.cli.replaced import replace_typed
 from posefilter.cli.resume import keep_record, with_resumed
@@ -58,6 +59,7 @@ from posefilter.errors import (
 from posefilter.files import write_whole
 from posefilter.locks import release_all
 from posefilter.paths import find_conf
+from posefilter.ranges import check_ranges
 from posefilter.signals import stopped_by_sigterm
 
 _FAILED = (FloatingPointError, ProblemsFound, NotThere)  # nothing is wrong with the command line
@@ -92,6 +94,9 @@ def run_command(name: str, home: Path | None = None, arguments: list[str] | None
                 import_plugin(package)  # which says so where there is no such package
         if {"--help", "-h"} & {*arguments}:
             print(describe_command(name, conf, arguments))
+            return 0
+        if "--version" in arguments:  # Hydra's own
+            print(describe_version())
             return 0
         arguments = without_trace(arguments, name)
         arguments = without_deletion(arguments)
@@ -202,6 +207,7 @@ def compose_config(name: str, overrides: list[str]) -> DictConfig:
         check_choices(overrides, conf, name)
         check_added(overrides, conf, name)
         job = compose_job(name, conf, loosen(bracketed(overrides), name), Path())
+        check_ranges(to_plain(job.cfg), name)
         if name == "train":
             check_fit(job.cfg, job.choices, Scope.CONFIG)
         return job.cfg

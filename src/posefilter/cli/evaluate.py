@@ -99,6 +99,8 @@ def _of_checkpoint(job: Job) -> tuple[dict[str, Any], dict[str, Path]]:
     data = build_data(settings, job.cfg.console, job.overrides)
     data.setup("test")
     method.set_object(object_to_judge(data, method.object_model))
+    if method.calibration is None and checkpoint.get("calibration") is not None:
+        say(job.cfg.console, "warning", f"warning: no probabilities: {method.calibration_note}")
     warn_of_several(data, job.cfg.console)
     warn_of_learned(str(job.cfg.checkpoint), data, job.cfg.console)
     records = Records()

@@ -39,7 +39,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(_USAGE, *(f"  {name:{width}}  {what}" for name, what in COMMANDS.items()), sep="\n")
         return 0
     if given[0] == "--version":
-        print(f"posefilter {version('posefilter')}")
+        print(describe_version())
         return 0
     if given[0] in ("-sc", "--shell_completion"):
         given = complete(given, os.environ.get("COMP_LINE", ""))
@@ -55,6 +55,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     from posefilter.cli.command import run_command  # Hydra: the list of commands needs none
 
     return run_command(name, arguments=given[1:])
+
+
+def describe_version() -> str:
+    """Return the program's name and version."""
+    return f"posefilter {version('posefilter')}"
 
 
 def complete(given: Sequence[str], line: str) -> list[str]:

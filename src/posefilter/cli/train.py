@@ -168,20 +168,22 @@ def fit(run: Run) -> dict[str, Any]:
 
 
 def check_validated(run: Run) -> None:
-    """Refuse a training that would end before its first validation: it would have no best
-    checkpoint.
+    """Refuse a training that would end before its first validation, so that it would have no best
+    checkpoint, or without a test.
 
     Raises:
         UserError: The settings, and the step of the first validation.
     """
     trainer = run.trainer
     every, interval = trainer.check_val_every_n_epoch, trainer.val_check_interval
-    for name in ("limit_train_batches", "limit_val_batches"):
+    needed = {
+        "limit_train_batches": "its validations, which choose the best checkpoint",
+        "limit_val_batches": "its validations, which choose the best checkpoint",
+        "limit_test_batches": "its test, with which it ends",
+    }
+    for name, what in needed.items():
         if getattr(trainer, name) == 0:
-            raise UserError(
-                f"trainer.{name}=0: a training needs its validations, which choose the best "
-                "checkpoint"
-            )
+            raise UserError(f"trainer.{name}=0: a training needs {what}")
     batches = count_batches(len(run.data.train_dataloader()), trainer.limit_train_batches)
     _check_epochs(trainer, batches)
     if every is None or trainer.max_steps < 0:
