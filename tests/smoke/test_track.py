@@ -23,6 +23,7 @@ from posefilter.cli.command import compose_job, run_command
 from posefilter.cli.track import make_settings
 from posefilter.cli.track_log import TrackLog, to_pose_row
 from posefilter.data.sequences import VideoFrame
+from posefilter.errors import UserError
 from posefilter.locks import LOCK, hold
 from posefilter.metrics.bop_results import read_poses_csv
 from posefilter.tracking.records import TrackRow
@@ -439,3 +440,9 @@ def test_the_commands_defaults_are_the_librarys(tmp_path: Path) -> None:
     assert vars(made.motion) == vars(own.motion)
     assert {**vars(made), "motion": 0} == {**vars(own), "motion": 0}
     assert {*OmegaConf.to_container(job.cfg.tracker)} == {*vars(own)}
+
+
+def test_a_section_that_is_switched_off_is_told(tmp_path: Path) -> None:
+    job = compose_job("track", HOME / "conf", ["tracker.follow=null"], tmp_path)
+    with pytest.raises(UserError, match=r"tracker\.follow=None: must be a section"):
+        make_settings(job.cfg.tracker)

@@ -240,6 +240,11 @@ def make_settings(node: DictConfig) -> TrackerSettings:
     Raises UserError where one is no number of its kind.
     """
     plain: Any = resolve(node)
+    for name in ("motion", "follow", "probe", "search"):
+        if not isinstance(plain[name], dict):
+            raise UserError(
+                f"tracker.{name}={plain[name]}: must be a section; leave it out for the default"
+            )
     try:
         plain["motion"] = ConstantVelocity(**plain["motion"])
         for name in ("follow", "probe", "search"):
