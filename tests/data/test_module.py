@@ -1,10 +1,13 @@
 """The data module: splits by scene, resizing with the camera, caches, epochs, broken files."""
 
 import dataclasses
+import gc
 import json
+import multiprocessing
 import subprocess
 import sys
 import textwrap
+from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
@@ -53,6 +56,15 @@ class Refusing(FrameDataset):
         raise self.error
 
 
+@pytest.fixture
+def ended() -> Iterator[None]:
+    """See that the loader's processes end with the test: they hold all of this process's pipes."""
+    yield
+    gc.collect()  # the error's traceback holds the loader, which ends them
+    assert not multiprocessing.active_children()
+
+
+@pytest.mark.usefixtures("ended")
 @pytest.mark.parametrize(
     ("error", "told"),
     [
@@ -67,6 +79,7 @@ def test_a_mistake_in_a_loaders_process_is_told_in_one_line(error: Exception, to
     assert str(caught.value) == told
 
 
+@pytest.mark.usefixtures("ended")
 def test_another_error_there_keeps_its_traceback() -> None:
     with pytest.raises(RuntimeError, match=r"(?s)^Caught RuntimeError in .*__getitem__"):
         next(iter(make_loader(Refusing(RuntimeError("mine")), 1, 1)))
