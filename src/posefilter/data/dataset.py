@@ -175,11 +175,23 @@ class ResumableLoader(DataLoader[Batch]):
             for batch in super().__iter__():
                 self._given += 1
                 yield batch
-        except (UserError, OSError, RuntimeError) as error:
-            told = _find_told_in_worker(error)
+        except Exception as error:
+            self.end_workers()
+            mistake = isinstance(error, UserError | OSError | RuntimeError)
+            told = _find_told_in_worker(error) if mistake else ""
             if not told:
                 raise
             raise UserError(told) from error
+
+    def end_workers(self) -> None:
+        """End the processes, if there are any; the next epoch starts others.
+
+        Where the loader is left to Python's collector of cycles, as an error's traceback is part
+        of, their queues are closed before they are told to end, and they stay.
+        """
+        if self._iterator is not None:
+            self._iterator._shutdown_workers()  # type: ignore[attr-defined]
+            self._iterator = None
 
     def state_dict(self) -> dict[str, int]:
         """Return how far the epoch is."""
@@ -212,5 +224,4 @@ def _end_workers() -> None:
     Multiprocessing would tell each once to terminate, which they leave to their parent, and wait.
     """
     for loader in _ITERATED:
-        if loader._iterator is not None:
-            loader._iterator._shutdown_workers()  # type: ignore[attr-defined]
+        loader.end_workers()
