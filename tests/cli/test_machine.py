@@ -3,14 +3,17 @@
 import multiprocessing
 import os
 import platform
+import random
 import subprocess
 import sys
 from concurrent.futures import ProcessPoolExecutor
 
+import lightning
+import numpy as np
 import pytest
 import torch
 
-from posefilter.cli.machine import device_name, settle_processes
+from posefilter.cli.machine import device_name, settle, settle_processes
 
 TEN_LARGE = """
 import resource, torch
@@ -69,3 +72,26 @@ def test_a_gpu_that_was_not_used_is_not_named(monkeypatch: pytest.MonkeyPatch) -
     assert "threads" in device_name()
     assert "threads" in device_name(torch.device("cpu"))
     assert device_name(torch.device("cuda:1")) == "GPU 1"
+
+
+def test_what_is_seeded_is_what_lightning_seeds(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("PL_GLOBAL_SEED", "PL_SEED_WORKERS"):
+        monkeypatch.setenv(name, "")
+
+    def draw() -> list[object]:
+        own = [os.environ["PL_GLOBAL_SEED"], os.environ["PL_SEED_WORKERS"]]
+        return [*own, random.random(), float(np.random.rand()), float(torch.rand(()))]  # noqa: NPY002
+
+    lightning.seed_everything(7, workers=True, verbose=False)
+    expected = draw()
+    settle(torch.get_num_threads(), 8)
+    assert draw() != expected
+    settle(torch.get_num_threads(), 7)
+    assert draw() == expected
+
+
+@pytest.mark.parametrize("command", ["predict", "track", "convert_bag"])
+def test_commands_that_train_nothing_import_no_lightning(command: str) -> None:
+    """That alone takes longer than an answer."""
+    code = f"import sys, posefilter.cli.{command}; sys.exit('lightning' in sys.modules)"
+    subprocess.run([sys.executable, "-c", code], check=True)

@@ -1,13 +1,15 @@
 """Threads, seeds, and what to remember of the machine and the code that made a result."""
 
 import multiprocessing
+import os
 import platform
+import random
 import subprocess
 from importlib import metadata
 from pathlib import Path
 
 import cv2
-import lightning
+import numpy as np
 import torch
 
 from posefilter.memory import keep_freed_memory
@@ -32,7 +34,15 @@ def settle(threads: int | None, seed: int) -> None:
     settle_processes()
     torch.set_num_threads(threads or min(8, torch.get_num_threads()))
     cv2.setNumThreads(1)
-    lightning.seed_everything(seed, workers=True, verbose=False)
+    _seed_everything(seed)
+
+
+def _seed_everything(seed: int) -> None:
+    """Do what Lightning's function of this name does, whose import takes longer than an answer."""
+    os.environ["PL_GLOBAL_SEED"], os.environ["PL_SEED_WORKERS"] = str(seed), "1"
+    random.seed(seed)
+    np.random.seed(seed)  # noqa: NPY002, global on purpose: of code that takes no generator
+    torch.manual_seed(seed)
 
 
 def settle_processes() -> None:
