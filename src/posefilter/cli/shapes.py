@@ -2,32 +2,37 @@
 
 import math
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 from omegaconf import DictConfig
 
-from posefilter.data.readers.registry import default_mesh_scale
 from posefilter.errors import UserError
 from posefilter.figures.overlay import Shape
-from posefilter.meshes.mesh import diameter
-from posefilter.meshes.store import MeshStore
 from posefilter.types import ObjectModel
+
+if TYPE_CHECKING:
+    from posefilter.meshes.store import MeshStore
 
 _SAME = 1.5  # meshes of one object in one unit differ by less
 _UNITS = (1.0, 0.001, 0.01, 0.0254, 1000.0)  # [m]
 
 
-def open_shapes(cfg: DictConfig, objects: Sequence[str]) -> MeshStore | None:
+def open_shapes(cfg: DictConfig, objects: Sequence[str]) -> "MeshStore | None":
     """Return the meshes of `meshes=`, in the unit of `mesh_scale=` or the default of datasets; None
     where none are given.
     """
     if not cfg.meshes:
         return None
+    # most are drawn by the hull that the checkpoint has, and need no readers of meshes
+    from posefilter.data.readers.registry import default_mesh_scale
+    from posefilter.meshes.store import MeshStore
+
     # of names alone: only BOP's own models are named obj_*
     scale = default_mesh_scale("bop", objects) if cfg.mesh_scale is None else cfg.mesh_scale
     return MeshStore(cfg.meshes, scale=scale)
 
 
-def load_shape(store: MeshStore | None, object_model: ObjectModel) -> Shape:
+def load_shape(store: "MeshStore | None", object_model: ObjectModel) -> Shape:
     """Return what to draw of an object: its mesh, or the checkpoint's hull where there are none.
 
     Raises:
@@ -36,6 +41,8 @@ def load_shape(store: MeshStore | None, object_model: ObjectModel) -> Shape:
     """
     if store is None:
         return object_model.hull
+    from posefilter.meshes.mesh import diameter
+
     mesh = store.load(object_model.name)
     ratio = diameter(mesh.vertices) / object_model.diameter
     if 1 / _SAME < ratio < _SAME:
