@@ -190,7 +190,7 @@ def test_a_plugin_that_cannot_be_imported_is_one_line(
 ) -> None:
     (tmp_path / "broken_plugin.py").write_text(content)
     monkeypatch.syspath_prepend(tmp_path)
-    monkeypatch.setattr("posefilter.cli.running.trust", lambda package: None)
+    monkeypatch.setattr("posefilter.cli.trust._trusted", set())
     typed = ["checkpoint=003_cracker_box", "out=a.ckpt", "plugins=[broken_plugin]"]
     assert run_command("export", HOME, typed) == 2
     (line,) = capfd.readouterr().err.splitlines()
