@@ -25,7 +25,7 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from marked import format_row, put_table, read_rows
+from marked import format_row, put_table, read_rows, split_row
 
 from posefilter.metrics.image_errors import FILE, ImageError, read_errors
 from posefilter.metrics.scores import auc, recall
@@ -310,10 +310,9 @@ def write_tables(root: Path, page: Path) -> None:
 
 def keep_cells(rows: Sequence[str], old: Sequence[str]) -> list[str]:
     """Return a table's rows with the old cells of the same method where the new ones are dashes."""
-    split = lambda row: row.strip("| ").split(" | ")  # noqa: E731
-    known = {split(row)[0]: split(row) for row in old}
+    known = {cells[0]: cells for cells in map(split_row, old)}
     kept = []
-    for row in map(split, rows):
+    for row in map(split_row, rows):
         before = known.get(row[0], row)
         kept.append(format_row([b if a == "–" else a for a, b in zip(row, before, strict=True)]))
     return kept

@@ -10,6 +10,11 @@ def format_row(cells: Iterable[str]) -> str:
     return f"| {' | '.join(cells)} |"
 
 
+def split_row(row: str) -> list[str]:
+    """Return the cells of a line of a table."""
+    return row.strip("| ").split(" | ")
+
+
 def read_rows(page: str, title: str) -> list[str]:
     """Return the lines of a table without its head, as they stand in the page.
 

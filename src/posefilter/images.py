@@ -7,10 +7,7 @@ import cv2
 import numpy as np
 import torch
 
-from posefilter.data.readers.plausible import (
-    find_center_flaw,
-    find_focal_flaw,
-)
+from posefilter.data.readers.plausible import find_center_flaw, find_focal_flaw
 from posefilter.data.resize import network_size, resize_depth
 from posefilter.errors import UserError
 from posefilter.geometry.camera import find_matrix_flaw, resize_intrinsics

@@ -131,14 +131,11 @@ class Result:
             return "unsure"
         if self.presence is None:
             return None
-        known = (
-            self.presence,
-            self.probability_within(pose_tolerance or self.pose_tolerance or RIGHT),
-        )
+        known = self.presence, self.probability_within(pose_tolerance or self.pose_tolerance)
         verdict = decide(*(known if prior == 0.5 else apply_prior(*known, prior)), costs)
         return "unsure" if verdict == "found" and self.wrong_size else verdict
 
-    def probability_within(self, pose_tolerance: PoseTolerance) -> float:
+    def probability_within(self, pose_tolerance: PoseTolerance | None) -> float:
         """Return the probability that the object is there and the pose within a tolerance.
 
         It is learned from the same calibration frames as `probability`, from how far their
@@ -148,7 +145,7 @@ class Result:
         Args:
             pose_tolerance: What a right pose is, such as `PoseTolerance(translation_mm=5,
                 rotation_deg=10)`, or `PoseTolerance(add_s=0.1)` where it does not matter how a can
-                is turned about its axis.
+                is turned about its axis; None: as of `probability`.
 
         Raises:
             UserError: There is no probability, or the checkpoint was calibrated by an earlier
@@ -161,7 +158,7 @@ class Result:
             why = self.calibration_note or "the image cannot be judged"
             raise UserError(f"{self.object}: has no probability ({why})")
         row = {name: torch.tensor([value]) for name, value in self.features.items()}
-        return float(self.calibration.assess(row, pose_tolerance).probability)
+        return float(self.calibration.assess(row, pose_tolerance or RIGHT).probability)
 
     @property
     def model(self) -> ObjectModel:

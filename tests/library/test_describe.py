@@ -47,7 +47,11 @@ def test_an_image_that_cannot_be_judged_is_told_also_without_a_probability() -> 
 
 
 def mark(one: SimpleNamespace) -> tuple[str, str]:
-    given = {"pose": np.eye(4), "warnings": (), "probability_within": lambda tolerance: 0.3}
+    given = {
+        "pose": np.eye(4),
+        "warnings": (),
+        "probability_within": lambda tolerance: one.probability if tolerance is None else 0.3,
+    }
     drawn = mark_result(SimpleNamespace(**{**given, **vars(one)}), None)  # type: ignore[arg-type]
     return drawn.label, drawn.tag
 

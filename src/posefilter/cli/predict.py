@@ -191,9 +191,8 @@ def mark_result(result: Result, shape: Shape) -> Drawn:
     if result.probability is None or result.presence is None:
         said, tag = f"score {result.score:.1f}", ""
     else:
-        asked = result.pose_tolerance  # which the verdict goes by
-        right = result.probability if asked is None else result.probability_within(asked)
-        said = describe_probability(right)
+        # by the tolerance that the verdict goes by
+        said = describe_probability(result.probability_within(result.pose_tolerance))
         tag = f"{result.object} {said}"
         if unsure:
             said = f"unsure {said}, there {describe_probability(result.presence)}"

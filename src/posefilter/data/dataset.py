@@ -177,11 +177,10 @@ class ResumableLoader(DataLoader[Batch]):
                 yield batch
         except Exception as error:
             self.end_workers()
-            mistake = isinstance(error, UserError | OSError | RuntimeError)
-            told = _find_told_in_worker(error) if mistake else ""
-            if not told:
+            message = _find_mistake_of_worker(error)
+            if not message:
                 raise
-            raise UserError(told) from error
+            raise UserError(message) from error
 
     def end_workers(self) -> None:
         """End the processes, if there are any; the next epoch starts others.
@@ -202,16 +201,18 @@ class ResumableLoader(DataLoader[Batch]):
         self._start = state["given"] % max(self.batches or len(self), 1)
 
 
-def _find_told_in_worker(error: Exception) -> str:
-    """Return what a mistake in a loader's process said, "" for other errors.
+def _find_mistake_of_worker(error: Exception) -> str:
+    """Return the message of a mistake in a loader's process, "" for other errors.
 
     Torch hands its traceback on as a message, by a RuntimeError where it cannot make such an error.
     """
     lines = str(error).splitlines() or [""]
-    if not (lines[0].startswith("Caught ") and "worker process" in lines[0]):
-        return ""
-    kind, _, told = lines[-1].partition(": ")
-    return told if not isinstance(error, RuntimeError) or kind.startswith("posefilter.") else ""
+    is_workers = lines[0].startswith("Caught ") and "worker process" in lines[0]
+    kind, _, message = lines[-1].partition(": ")
+    own = isinstance(error, UserError | OSError) or (
+        isinstance(error, RuntimeError) and kind.startswith("posefilter.")
+    )
+    return message if is_workers and own else ""
 
 
 _ITERATED: WeakSet[ResumableLoader] = WeakSet()
