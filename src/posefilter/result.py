@@ -131,7 +131,8 @@ class Result:
             return "unsure"
         if self.presence is None:
             return None
-        known = self.presence, self.probability_within(pose_tolerance or self.pose_tolerance)
+        tolerance = pose_tolerance or self.pose_tolerance or RIGHT
+        known = self.presence, self.probability_within(tolerance)
         verdict = decide(*(known if prior == 0.5 else apply_prior(*known, prior)), costs)
         return "unsure" if verdict == "found" and self.wrong_size else verdict
 
