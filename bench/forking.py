@@ -34,6 +34,7 @@ from posefilter.cli.command import run_command
 
 HOME = Path(__file__).parents[1]
 RAW = 70  # exit status of a process whose command ended in a traceback
+_WARM: set[tuple[str, ...]] = set()  # what was run in this process
 
 
 class Ended(NamedTuple):
@@ -60,15 +61,18 @@ def prepare() -> None:
 
 
 def warm(lines: Mapping[str, Sequence[str]]) -> None:
-    """Run commands in this process, so that what they import and keep is paid once; what is there
-    afterwards is not looked at by a forked process's garbage collection.
+    """Run commands in this process, each once, so that what they import and keep is paid once; what
+    is there afterwards is not looked at by a forked process's garbage collection.
 
     Args:
         lines: What is typed after each command's name; each must work.
     """
     with Path(os.devnull).open("w") as nowhere, redirect_stdout(nowhere):
         for command, arguments in lines.items():
-            assert run_command(command, HOME, list(arguments)) == 0, command
+            typed = (command, *(one for one in arguments if not one.startswith("out=")))
+            if typed not in _WARM:
+                assert run_command(command, HOME, list(arguments)) == 0, command
+                _WARM.add(typed)
     gc.collect()
     gc.freeze()
 

@@ -6,8 +6,9 @@ indices on the CPU; numpy cannot read marked tensors; and a generator draws on i
 Kernels, streams, memory and types are not simulated.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
+from functools import cache
 from typing import Any, ClassVar
 
 import pytest
@@ -77,13 +78,16 @@ class SimulatedGpu(TorchFunctionMode):
         if name == "_parse_to":  # of `Module.to`, which moves each tensor then
             return func(*args, **kwargs)
         if name == "__get__":
-            return _read_property((resolve_name(func) or "..").split(".")[-2], func, args)
+            return _read_property(func, args)
         if name in ("numpy", "__array__") and isinstance(args[0], Marked):
             raise TypeError("can't convert cuda:0 device type tensor to numpy.")
-        tensors = [one for one in _walk([args, kwargs]) if isinstance(one, Tensor)]
+        leaves: list[Any] = []
+        _collect((args, kwargs), leaves)
+        tensors = [one for one in leaves if isinstance(one, Tensor)]
+        devices = [one for one in leaves if isinstance(one, str | torch.device)]
         if name not in (*_ANY_DEVICE, *_SHAPED_AS):
             _check_devices(name, tensors)
-        on_gpu = _find_device(name, args, kwargs, tensors)
+        on_gpu = _find_device(name, args, "device" in kwargs, tensors, devices)
         if SimulatedGpu.records:
             _check_recorded(name, on_gpu, args, tensors)
         generator = kwargs.get("generator")
@@ -91,17 +95,19 @@ class SimulatedGpu(TorchFunctionMode):
             raise RuntimeError(f"{name}: the generator is not of the device of the numbers")
         # marked first: what is marked with a gradient would be no leaf
         leaf = on_gpu and not tensors and kwargs.pop("requires_grad", False)
-        kind, known = Marked if on_gpu else Tensor, {id(one) for one in tensors}
+        kind = Marked if on_gpu else Tensor
 
         def mark(one: Any) -> Any:
             if not isinstance(one, Tensor) or isinstance(one, Marked) == on_gpu:
                 return one
-            if id(one) in known and name not in ("to", "cpu", "cuda"):
+            if name not in ("to", "cpu", "cuda") and any(one is given for given in tensors):
                 return one  # changed in place
             marked = one.as_subclass(kind)
             return marked.requires_grad_() if leaf else marked
 
-        return _map(func(*_map(args, _to_cpu), **_map(kwargs, _to_cpu)), mark)
+        if any(_is_gpu(one) for one in devices):
+            args, kwargs = _map(args, _to_cpu), _map(kwargs, _to_cpu)
+        return _map(func(*args, **kwargs), mark)
 
 
 @contextmanager
@@ -152,19 +158,19 @@ def _to_cpu(one: Any) -> Any:
     return "cpu" if _is_gpu(one) else one
 
 
-def _walk(value: Any) -> Iterator[Any]:
-    if isinstance(value, list | tuple):
-        for one in value:
-            yield from _walk(one)
-    elif isinstance(value, dict):
-        yield from _walk([*value.values()])
-    else:
-        yield value
+def _collect(values: Iterable[Any], into: list[Any]) -> None:
+    for one in values:
+        if isinstance(one, list | tuple):
+            _collect(one, into)
+        elif isinstance(one, dict):
+            _collect(one.values(), into)
+        else:
+            into.append(one)
 
 
 def _map(value: Any, change: Callable[[Any], Any]) -> Any:
-    if isinstance(value, torch.Size):
-        return value
+    if isinstance(value, Tensor | torch.Size):
+        return change(value) if isinstance(value, Tensor) else value
     if isinstance(value, dict):
         return {key: _map(one, change) for key, one in value.items()}
     if isinstance(value, list | tuple):
@@ -175,17 +181,15 @@ def _map(value: Any, change: Callable[[Any], Any]) -> Any:
     return change(value)
 
 
-def _find_device(name: str, args: Any, kwargs: dict[str, Any], tensors: list[Tensor]) -> bool:
+def _find_device(
+    name: str, args: Any, has_device: bool, tensors: list[Tensor], devices: list[Any]
+) -> bool:
     """Return whether an operation's results are on the GPU."""
-    asked = [one for one in _walk([args, kwargs]) if isinstance(one, torch.device)]
-    if name in _ANY_DEVICE or "device" in kwargs:
-        asked += [
-            one
-            for one in _walk([args, kwargs])
-            if isinstance(one, str) and one[:3] in ("cpu", "cud")
-        ]
     if name in ("cpu", "cuda"):
         return name == "cuda"
+    asked = [one for one in devices if isinstance(one, torch.device)]
+    if name in _ANY_DEVICE or has_device:
+        asked += [one for one in devices if isinstance(one, str) and one[:3] in ("cpu", "cud")]
     if asked:
         return _is_gpu(asked[0])
     if name == "to":
@@ -198,7 +202,12 @@ def _find_device(name: str, args: Any, kwargs: dict[str, Any], tensors: list[Ten
 def _check_devices(name: str, tensors: list[Tensor]) -> None:
     if name in _BY_INDEX and isinstance(tensors[0], Marked):
         tensors = [one for one in tensors if one.dtype not in (torch.int64, torch.bool)]
-    if len({isinstance(one, Marked) for one in tensors if one.dim() > 0}) > 1:
+    marked = [isinstance(one, Marked) for one in tensors]
+    if (
+        any(marked)
+        and not all(marked)
+        and len({m for m, one in zip(marked, tensors, strict=True) if one.dim() > 0}) > 1
+    ):
         raise RuntimeError(
             f"{name}: Expected all tensors to be on the same device, but found cuda:0 and cpu"
         )
@@ -217,12 +226,18 @@ def _check_recorded(name: str, on_gpu: bool, args: Any, tensors: list[Tensor]) -
         raise RuntimeError(f"{name}: cannot be recorded as a CUDA graph")
 
 
-def _read_property(name: str, func: Any, args: Any) -> Any:
+def _read_property(func: Any, args: Any) -> Any:
     own = args[0]
     if not isinstance(own, Marked):
         return func(*args)
+    name = _name_property(func)
     if name in ("device", "is_cuda", "is_cpu"):
         return {"device": GPU, "is_cuda": True, "is_cpu": False}[name]
     out = func(*args)
     plain = isinstance(out, Tensor) and not isinstance(out, Marked)
     return out.as_subclass(Marked) if plain else out
+
+
+@cache  # torch's own search of the name takes longer than most properties
+def _name_property(func: Any) -> str:
+    return (resolve_name(func) or "..").split(".")[-2]

@@ -51,16 +51,22 @@ def test_what_nobody_notices_is_told(
     assert mutations.try_one(base, work, None)[1] == "raw traceback"
 
 
+@pytest.fixture(scope="module")
+def kept(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return the folder of what trainings of the same code can use: data, and those not killed."""
+    return tmp_path_factory.mktemp("kept")
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("workers", ["0", "2"])
 @pytest.mark.parametrize("model", ["pose_pf", "patch_pf", "pixel_pf", "cnn_patch", "downsized"])
 def test_killed_trainings_end_with_the_same_bits(
-    load: Load, tmp_path: Path, model: str, workers: str
+    load: Load, tmp_path: Path, kept: Path, model: str, workers: str
 ) -> None:
     """Twenty kills in all."""
     kills = load("kills")
     kills.prepare()
-    counts = kills.kill_many(tmp_path, [(model, workers)], 2, seed=3)
+    counts = kills.kill_many(tmp_path, [(model, workers)], 2, seed=3, keep=kept)
     assert sum(counts.values()) == 2
     assert all(what.startswith("the same bits, killed") for what in counts), counts
 
