@@ -11,6 +11,7 @@ import torch
 from posefilter.data.frames import Sample
 from posefilter.data.silhouette import Geometry
 from posefilter.geometry.camera import resize_intrinsics
+from posefilter.geometry.rigid import rigid
 from posefilter.meshes import ycb
 from posefilter.meshes.store import Mesh
 
@@ -197,8 +198,7 @@ def _frames(view: View) -> list[tuple[str, np.ndarray]]:
             ("poses are in YCB-Video's object frame, meshes in the original (google_16k) one", on),
             ("poses are in the original (google_16k) frame, meshes in YCB-Video's", back),
         ]
-    center = np.eye(4)
-    center[:3, 3] = -view.mesh.bounds.mean(0)
+    center = rigid(np.eye(3), -view.mesh.bounds.mean(0))
     words = "poses are in a frame at the center of the bounding box (as BOP's)"
     return [*out, (f"{words}, the mesh has another origin", center)]
 

@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 
 from posefilter.errors import UserError
+from posefilter.geometry.rigid import move
 from posefilter.paths import is_plain_name
 
 
@@ -33,5 +34,4 @@ def read_model_points(
         raise UserError(f"{path}: not rows of three numbers ({error})") from error
     if native.shape[1] != 3 or len(native) < 4 or not np.isfinite(native).all():
         raise UserError(f"{path}: not rows of three numbers (found {native.shape})")
-    mesh_from_native = np.linalg.inv(native_from_mesh)
-    return native @ mesh_from_native[:3, :3].T + mesh_from_native[:3, 3]
+    return move(native, np.linalg.inv(native_from_mesh))

@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 
 from posefilter.data.frames import Sample
+from posefilter.geometry.rigid import move
 from posefilter.meshes.store import Mesh, MeshStore
 from posefilter.rendering.embree import EmbreeRenderer, render_depth
 
@@ -102,7 +103,7 @@ def _margins(
     it may.
     """
     size = np.array(shape)
-    points = vertices @ pose[:3, :3].T + pose[:3, 3]
+    points = move(vertices, pose)
     if (points[:, 2] <= 0).any():
         return size, size
     pixels = (points[:, :2] / points[:, 2:]) @ K[:2, :2].T + K[:2, 2]

@@ -15,6 +15,7 @@ import torch
 import trimesh
 from scipy.spatial import cKDTree
 
+from posefilter.geometry.rigid import move
 from posefilter.geometry.rotation import log_so3
 from posefilter.meshes.mesh import (
     Mesh,
@@ -136,13 +137,9 @@ def _excess(after: np.ndarray, before: np.ndarray, of: Callable[[np.ndarray], An
     return float(of(after) - of(before))
 
 
-def _move(points: np.ndarray, transform: np.ndarray) -> np.ndarray:
-    return points @ transform[:3, :3].T + transform[:3, 3]
-
-
 def _distances(surface: _Surface, transform: np.ndarray) -> np.ndarray:
     """Return how far the samples, moved, are from the surface.  -> (P,) [m]."""
-    return np.asarray(surface.nearest.query(_move(surface.points, transform))[0])
+    return np.asarray(surface.nearest.query(move(surface.points, transform))[0])
 
 
 def _color_change(surface: _Surface, transform: np.ndarray) -> np.ndarray:
@@ -150,7 +147,7 @@ def _color_change(surface: _Surface, transform: np.ndarray) -> np.ndarray:
 
     Means of 16 neighbors on the same side of the surface: print finer than the sampling is noise.
     """
-    moved = _move(surface.points, transform), surface.normals @ transform[:3, :3].T
+    moved = move(surface.points, transform), surface.normals @ transform[:3, :3].T
     near = surface.nearest_side.query(np.concatenate(moved, axis=1), k=16)[1]
     return np.asarray(np.abs(surface.dense_colors[near].mean(1) - surface.colors).mean(1))
 
@@ -160,7 +157,7 @@ def _register(surface: _Surface, transform: np.ndarray, rounds: int = 15) -> np.
     farthest tenth left out.
     """
     for _ in range(rounds):
-        moved = _move(surface.points, transform)
+        moved = move(surface.points, transform)
         distance, near = surface.nearest.query(moved)
         kept = distance <= np.quantile(distance, 0.9)
         step, _, _ = trimesh.registration.procrustes(

@@ -7,6 +7,7 @@ import torch
 
 from posefilter.errors import UserError
 from posefilter.geometry.pose import is_rigid
+from posefilter.geometry.rigid import rigid
 from posefilter.geometry.rotation import exp_so3
 from posefilter.limits import read_json
 
@@ -46,10 +47,8 @@ def rotation_about(axis: np.ndarray, angle: float, point: np.ndarray) -> np.ndar
 
     Unit axis (3,), a point on it (3,) [m] -> (4, 4).
     """
-    out = np.eye(4)
-    out[:3, :3] = exp_so3(torch.as_tensor(np.asarray(axis, dtype=np.float64) * angle)).numpy()
-    out[:3, 3] = point - out[:3, :3] @ point
-    return out
+    turn = exp_so3(torch.as_tensor(np.asarray(axis, dtype=np.float64) * angle)).numpy()
+    return rigid(turn, point - turn @ point)
 
 
 _ALONE = {"symmetries_discrete", "symmetries_continuous"}  # keys of a file for one object

@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 
 from posefilter.errors import UserError
+from posefilter.geometry.rigid import move
 from posefilter.meshes.mesh import Mesh, hull_vertices
 from posefilter.rendering.surfaces import NEAR, Instance, Lights, Surfaces, covered_pixels, unit
 
@@ -94,11 +95,7 @@ class RayCaster:
             K: (3, 3) camera matrix [px].
         """
         mesh = self.prepare(one.mesh)
-        pixel = covered_pixels(
-            mesh.hull @ one.camera_from_object[:3, :3].T + one.camera_from_object[:3, 3],
-            K,
-            rays.shape[:2],
-        )
+        pixel = covered_pixels(move(mesh.hull, one.camera_from_object), K, rays.shape[:2])
         if len(pixel) == 0:
             empty = np.zeros(0, np.float32)
             return Hits(pixel, empty, empty, empty, np.zeros(0, np.int32))
@@ -152,7 +149,7 @@ class RayCaster:
             if len(where) == 0:
                 continue
             inverse = np.linalg.inv(one.camera_from_object)
-            origin = (points[where] @ inverse[:3, :3].T + inverse[:3, 3]).astype(np.float32)
+            origin = move(points[where], inverse).astype(np.float32)
             direction = np.broadcast_to(
                 (inverse[:3, :3] @ L).astype(np.float32), origin.shape
             ).copy()
@@ -169,7 +166,7 @@ class RayCaster:
 
 def _bounding_sphere(one: Instance, mesh: CastMesh) -> tuple[np.ndarray, float]:
     """Return center (3,) and radius of an instance's bounding sphere, in the camera [m]."""
-    points = mesh.hull @ one.camera_from_object[:3, :3].T + one.camera_from_object[:3, 3]
+    points = move(mesh.hull, one.camera_from_object)
     center = (points.min(0) + points.max(0)) / 2
     return center.astype(np.float32), float(np.linalg.norm(points - center, axis=1).max())
 

@@ -18,10 +18,10 @@ import numpy as np
 import torch
 
 from posefilter.files import write_whole
+from posefilter.geometry.rigid import rigid
 from posefilter.geometry.rotation import quat_xyzw_from_matrix
 from posefilter.meshes.mesh import Mesh
 from posefilter.rendering.surfaces import project
-from posefilter.synthetic.solids import rigid
 
 CM = 100.0  # centimeters a meter
 DEPTH_UNITS = 10_000.0  # depth image units a meter

@@ -12,10 +12,10 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from posefilter.errors import UserError
+from posefilter.geometry.rigid import rigid
 from posefilter.rendering.surfaces import Plane
 from posefilter.synthetic.placing import Placed, View, are_separate
 from posefilter.synthetic.scenes import Layout
-from posefilter.synthetic.solids import rigid
 
 MOTIONS = ("none", "camera", "object", "both")
 _PERIODS = (16.0, 48.0)  # [frames] of the sine along each axis

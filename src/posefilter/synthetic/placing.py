@@ -6,8 +6,9 @@ from functools import cached_property
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from posefilter.geometry.rigid import move, rigid
 from posefilter.rendering.surfaces import project
-from posefilter.synthetic.solids import Solid, outline_mask, rigid, separated
+from posefilter.synthetic.solids import Solid, outline_mask, separated
 
 _STRIDE = 8  # [px] of the masks by which occlusion is predicted
 _NEAREST = 0.2  # [m] no object comes nearer to the camera
@@ -25,7 +26,7 @@ class Placed:
     @cached_property
     def hull(self) -> np.ndarray:
         """The hull's vertices in the camera, (V, 3) [m]."""
-        return self.solid.hull @ self.camera_from_object[:3, :3].T + self.camera_from_object[:3, 3]
+        return move(self.solid.hull, self.camera_from_object)
 
     @cached_property
     def center(self) -> np.ndarray:
@@ -104,11 +105,10 @@ def set_table(
         half_extent: Half of the table's sides [m].
         rng: Source of randomness.
     """
-    turn = np.eye(4)
-    turn[:3, :3] = Rotation.from_euler("z", rng.uniform(-45, 45), degrees=True).as_matrix()
+    turn = Rotation.from_euler("z", rng.uniform(-45, 45), degrees=True).as_matrix()
     room = np.maximum(0.75 * np.array(half_extent) - 0.1, 0.05)
-    turn[:2, 3] = turn[:2, :2] @ (rng.uniform(-1, 1, 2) * room)
-    return Table(camera_from_spot, camera_from_spot @ turn, half_extent)
+    shift = turn[:2, :2] @ (rng.uniform(-1, 1, 2) * room)
+    return Table(camera_from_spot, camera_from_spot @ rigid(turn, [*shift, 0]), half_extent)
 
 
 def place_target_on_table(

@@ -10,6 +10,7 @@ from functools import cache
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from posefilter.geometry.rigid import rigid
 from posefilter.meshes.mesh import LOOKALIKE
 from posefilter.meshes.store import MeshStore
 from posefilter.rendering.surfaces import Instance, Lights, Plane
@@ -26,7 +27,7 @@ from posefilter.synthetic.placing import (
     set_table,
 )
 from posefilter.synthetic.settle import settle
-from posefilter.synthetic.solids import Solid, make_solid, rigid
+from posefilter.synthetic.solids import Solid, make_solid
 from posefilter.synthetic.textures import random_color, random_texture
 
 # [degrees] highest camera over a table where something has to stand in front

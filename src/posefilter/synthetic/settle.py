@@ -11,8 +11,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from posefilter.errors import missing_package
+from posefilter.geometry.rigid import move, rigid
 from posefilter.synthetic.placing import Placed, Table, are_separate
-from posefilter.synthetic.solids import Solid, rigid
+from posefilter.synthetic.solids import Solid
 
 _STEP = 0.004  # [s]
 _LONGEST = 2.0  # [s]; round things roll on for ever
@@ -82,9 +83,7 @@ def _drop(one: Placed, placed: Sequence[Placed], table: Table, rng: np.random.Ge
     turn = Rotation.random(rng=rng).as_matrix()
     pose = rigid(turn, one.center - turn @ one.solid.center)
     up = table.camera_from_spot[:3, 2]
-    lowest = (
-        (one.solid.hull @ pose[:3, :3].T + pose[:3, 3] - table.camera_from_spot[:3, 3]) @ up
-    ).min()
+    lowest = ((move(one.solid.hull, pose) - table.camera_from_spot[:3, 3]) @ up).min()
     pose[:3, 3] += up * (rng.uniform(0.01, 0.12) - lowest)
     held = Placed(one.solid, pose)
     return held if all(other is one or are_separate(held, other) for other in placed) else one

@@ -1,6 +1,5 @@
 """The geometry of a mesh that placing needs: convex hull, bounding sphere, stable rotations."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -68,13 +67,6 @@ def find_stable_rotations(hull: np.ndarray, directions: int = 200) -> tuple[np.n
     return np.stack([rotation_down(d) for d in np.stack(ends)[keep]]), weights[keep] / weights[
         keep
     ].sum()
-
-
-def rigid(rotation: np.ndarray, translation: Sequence[float] | np.ndarray) -> np.ndarray:
-    """Return a rigid transform (4, 4) of a rotation (3, 3) and a translation (3,) [m]."""
-    out = np.eye(4)
-    out[:3, :3], out[:3, 3] = rotation, translation
-    return out
 
 
 def rotation_down(direction: np.ndarray) -> np.ndarray:

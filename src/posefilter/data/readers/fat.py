@@ -37,6 +37,7 @@ from posefilter.data.readers.fat_settings import (
 from posefilter.data.readers.naming import choose_objects, choose_several
 from posefilter.data.readers.plausible import check_camera
 from posefilter.errors import BadData, UserError
+from posefilter.geometry.rigid import move
 from posefilter.limits import read_json
 from posefilter.meshes import ycb
 from posefilter.meshes.store import MeshStore
@@ -269,7 +270,7 @@ class FatReader(BaseReader):
         mesh = None if self._geometry is None else self._geometry.mesh(name)
         if mesh is None or kind.dimensions is None or self._geometry is None:
             return
-        aligned = mesh.vertices @ kind.aligned_from_mesh[:3, :3].T + kind.aligned_from_mesh[:3, 3]
+        aligned = move(mesh.vertices, kind.aligned_from_mesh)
         low, high = aligned.min(0), aligned.max(0)
         off = max(np.abs(high - low - kind.dimensions).max(), np.abs(high + low).max() / 2)
         if off > _CUBOID_TOLERANCE:

@@ -19,6 +19,7 @@ from posefilter.data.readers.decode import (
 )
 from posefilter.errors import BadData, UserError
 from posefilter.geometry.pose import is_rigid
+from posefilter.geometry.rigid import rigid
 from posefilter.geometry.rotation import matrix_from_quat_xyzw
 from posefilter.limits import MOST_SIDE, read_json
 from posefilter.paths import is_plain_name
@@ -141,7 +142,5 @@ def camera_from_aligned(record: Any, path: Path, where: str) -> np.ndarray:
         raise BadData(
             path, f"'{where}quaternion_xyzw' is not a unit quaternion", f"norm {norm:.3g}"
         )
-    pose = np.eye(4)
-    pose[:3, :3] = matrix_from_quat_xyzw(torch.from_numpy(quat / norm)).numpy()
-    pose[:3, 3] = numbers(record, "location", path, (3,), where) * CM
-    return pose
+    rotation = matrix_from_quat_xyzw(torch.from_numpy(quat / norm)).numpy()
+    return rigid(rotation, numbers(record, "location", path, (3,), where) * CM)

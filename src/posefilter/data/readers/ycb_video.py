@@ -31,6 +31,7 @@ from posefilter.data.readers.ycb_video_files import (
 )
 from posefilter.errors import BadData, UserError
 from posefilter.geometry.pose import is_rigid
+from posefilter.geometry.rigid import rigid
 from posefilter.meshes import ycb
 from posefilter.meshes.store import MeshStore
 from posefilter.paths import check_inside
@@ -257,8 +258,7 @@ class YCBVideoReader(BaseReader):
         return entries
 
     def _in_mesh_frame(self, camera_from_native: np.ndarray, name: str, path: Path) -> np.ndarray:
-        pose = np.eye(4)
-        pose[:3] = camera_from_native
+        pose = rigid(camera_from_native[:, :3], camera_from_native[:, 3])
         if not is_rigid(torch.from_numpy(pose), tolerance=2e-3):
             raise BadData(path, "'poses' holds a matrix that is no rotation", name)
         return pose @ self._native[name]
