@@ -9,64 +9,42 @@ from itertools import count
 
 import numpy as np
 
+from posefilter.geometry.rigid import rigid
 from posefilter.meshes.mesh import Mesh
 from posefilter.meshes.symmetries import rotation_about, symmetry_group
 
-# YCB-Video's order; label images and cls_indexes count from 1, FAT's segmentation ids in steps of
-# 12.
-CLASSES = (
-    "002_master_chef_can",
-    "003_cracker_box",
-    "004_sugar_box",
-    "005_tomato_soup_can",
-    "006_mustard_bottle",
-    "007_tuna_fish_can",
-    "008_pudding_box",
-    "009_gelatin_box",
-    "010_potted_meat_can",
-    "011_banana",
-    "019_pitcher_base",
-    "021_bleach_cleanser",
-    "024_bowl",
-    "025_mug",
-    "035_power_drill",
-    "036_wood_block",
-    "037_scissors",
-    "040_large_marker",
-    "051_large_clamp",
-    "052_extra_large_clamp",
-    "061_foam_brick",
-)
-
-# The public google_16k mesh of the wood block is another scan than YCB-Video's and FAT's: no frame
-# relation fits it.
-WITHOUT_GEOMETRY = frozenset({"036_wood_block"})
-
-# ycbvideo_from_original is this translation alone [m]: rotations fitted freely are below 0.22
-# degrees and nearest-neighbor residuals below 0.5 mm, for all classes but 036_wood_block (12
-# degrees, 3 mm), which is therefore not listed.
-_YCBVIDEO_FROM_ORIGINAL = {
-    "002_master_chef_can": (0.01567, 0.010218, -0.073504),
-    "003_cracker_box": (0.012323, 0.012463, -0.108328),
-    "004_sugar_box": (0.008344, 0.01523, -0.092397),
-    "005_tomato_soup_can": (0.008911, -0.082406, -0.059366),
-    "006_mustard_bottle": (0.014056, 0.021051, -0.080656),
-    "007_tuna_fish_can": (0.026091, 0.021939, -0.017692),
-    "008_pudding_box": (-0.001824, -0.015297, -0.022003),
-    "009_gelatin_box": (0.021334, 0.008739, -0.018102),
-    "010_potted_meat_can": (0.030441, 0.025891, -0.046519),
-    "011_banana": (0.007241, -0.004849, -0.01655),
-    "019_pitcher_base": (0.000464, -0.046305, -0.144018),
-    "021_bleach_cleanser": (0.016661, -0.009272, -0.11157),
-    "024_bowl": (0.015, 0.042514, -0.023979),
-    "025_mug": (0.017112, -0.016645, -0.038484),
-    "035_power_drill": (0.036932, -0.031553, -0.023304),
-    "037_scissors": (-0.017069, -0.007727, -0.007391),
-    "040_large_marker": (0.035649, 0.007239, -0.00951),
-    "051_large_clamp": (0.004176, 0.010065, -0.018803),
-    "052_extra_large_clamp": (0.020011, 0.035515, -0.017913),
-    "061_foam_brick": (0.018448, -0.017271, -0.016884),
+# In YCB-Video's order (label images and cls_indexes count from 1, FAT's segmentation ids in steps
+# of 12), each class with two translations [m].
+# The first is ycbvideo_from_original: rotations fitted freely are below 0.22 degrees and
+# nearest-neighbor residuals below 0.5 mm, for all classes but 036_wood_block (12 degrees, 3 mm),
+# whose public google_16k mesh is another scan than YCB-Video's and FAT's.
+# The second is the center of the bounding box of YCB-Video's models: the origin of BOP's YCB-V
+# models, which are not turned.
+_FRAMES = {
+    "002_master_chef_can": ((0.01567, 0.010218, -0.073504), (-0.00134, 0.0005, -0.00351)),
+    "003_cracker_box": ((0.012323, 0.012463, -0.108328), (-0.00056, -0.0017, -0.0048)),
+    "004_sugar_box": ((0.008344, 0.01523, -0.092397), (0.00095, -0.00147, -0.00436)),
+    "005_tomato_soup_can": ((0.008911, -0.082406, -0.059366), (2e-05, 0.00153, -0.0084)),
+    "006_mustard_bottle": ((0.014056, 0.021051, -0.080656), (-0.0013, -0.00249, 0.01183)),
+    "007_tuna_fish_can": ((0.026091, 0.021939, -0.017692), (0.00016, -0.00012, -0.00426)),
+    "008_pudding_box": ((-0.001824, -0.015297, -0.022003), (-0.00116, 0.0042, -0.00312)),
+    "009_gelatin_box": ((0.021334, 0.008739, -0.018102), (-0.00145, 0.00059, -0.00361)),
+    "010_potted_meat_can": ((0.030441, 0.025891, -0.046519), (-0.00242, -0.00031, -0.00807)),
+    "011_banana": ((0.007241, -0.004849, -0.01655), (0.01867, -0.01219, 0.00146)),
+    "019_pitcher_base": ((0.000464, -0.046305, -0.144018), (-0.00534, -0.00589, -0.02561)),
+    "021_bleach_cleanser": ((0.016661, -0.009272, -0.11157), (-0.00493, 0.00248, 0.01329)),
+    "024_bowl": ((0.015, 0.042514, -0.023979), (0.00023, -0.00079, 0.00297)),
+    "025_mug": ((0.017112, -0.016645, -0.038484), (0.00847, 0.0007, 0.00161)),
+    "035_power_drill": ((0.036932, -0.031553, -0.023304), (-0.00907, -0.02094, 0.00212)),
+    "036_wood_block": None,
+    "037_scissors": ((-0.017069, -0.007727, -0.007391), (-0.00705, 0.02813, -4e-05)),
+    "040_large_marker": ((0.035649, 0.007239, -0.00951), (-5e-05, 0.0021, -0.00035)),
+    "051_large_clamp": ((0.004176, 0.010065, -0.018803), (-0.01052, 0.00196, 0.00047)),
+    "052_extra_large_clamp": ((0.020011, 0.035515, -0.017913), (0.00039, 0.01041, -0.00016)),
+    "061_foam_brick": ((0.018448, -0.017271, -0.016884), (8e-05, -8e-05, 0.00824)),
 }
+CLASSES = tuple(_FRAMES)
+WITHOUT_GEOMETRY = frozenset(name for name, frames in _FRAMES.items() if frames is None)
 
 # Declared symmetries, for training and labels only: ADD and ADD-S as published ignore them.
 # YCB-Video (Xiang et al. 2018) and BOP list bowl, wood block, both clamps and foam brick. Which
@@ -148,9 +126,24 @@ def ycbvideo_from_original(name: str) -> np.ndarray:
     Raises:
         KeyError: No rigid transform fits that class.
     """
-    out = np.eye(4)
-    out[:3, 3] = _YCBVIDEO_FROM_ORIGINAL[name]
-    return out
+    return rigid(np.eye(3), _find_frames(name)[0])
+
+
+def bop_from_original(name: str) -> np.ndarray:
+    """Return the transform (4, 4) [m] from the frame of the google_16k mesh to BOP's of YCB-V.
+
+    Raises:
+        KeyError: No rigid transform fits that class.
+    """
+    to_ycbvideo, center = _find_frames(name)
+    return rigid(np.eye(3), np.subtract(to_ycbvideo, center))
+
+
+def _find_frames(name: str) -> tuple[tuple[float, float, float], tuple[float, float, float]]:
+    frames = _FRAMES[name]
+    if frames is None:
+        raise KeyError(name)
+    return frames
 
 
 def symmetries(name: str, steps: int = 36) -> np.ndarray | None:

@@ -26,6 +26,7 @@ from posefilter.data.readers.naming import choose_objects, need_text
 from posefilter.data.readers.plausible import check_camera, check_units
 from posefilter.errors import BadData, UserError
 from posefilter.geometry.pose import is_rigid
+from posefilter.geometry.rigid import rigid
 from posefilter.limits import read_json
 from posefilter.meshes import ycb
 from posefilter.meshes.store import MeshStore
@@ -37,30 +38,6 @@ _DEPTH_ENDINGS = ("png", "tif", "tiff", "PNG", "TIF", "TIFF")  # ITODD's images 
 _INFO = "models_info.json"
 _SAME_DIAMETER = 0.05  # share by which BOP's models of YCB-V may differ from YCB's own
 _IMAGE = _SCENE = re.compile(r"[0-9]{1,9}")
-# Center of the bounding box of YCB-Video's models [m]: the origin of BOP's YCB-V models, which are
-# not turned.
-_YCBV_CENTERS = {
-    "002_master_chef_can": (-0.00134, 0.0005, -0.00351),
-    "003_cracker_box": (-0.00056, -0.0017, -0.0048),
-    "004_sugar_box": (0.00095, -0.00147, -0.00436),
-    "005_tomato_soup_can": (2e-05, 0.00153, -0.0084),
-    "006_mustard_bottle": (-0.0013, -0.00249, 0.01183),
-    "007_tuna_fish_can": (0.00016, -0.00012, -0.00426),
-    "008_pudding_box": (-0.00116, 0.0042, -0.00312),
-    "009_gelatin_box": (-0.00145, 0.00059, -0.00361),
-    "010_potted_meat_can": (-0.00242, -0.00031, -0.00807),
-    "011_banana": (0.01867, -0.01219, 0.00146),
-    "019_pitcher_base": (-0.00534, -0.00589, -0.02561),
-    "021_bleach_cleanser": (-0.00493, 0.00248, 0.01329),
-    "024_bowl": (0.00023, -0.00079, 0.00297),
-    "025_mug": (0.00847, 0.0007, 0.00161),
-    "035_power_drill": (-0.00907, -0.02094, 0.00212),
-    "037_scissors": (-0.00705, 0.02813, -4e-05),
-    "040_large_marker": (-5e-05, 0.0021, -0.00035),
-    "051_large_clamp": (-0.01052, 0.00196, 0.00047),
-    "052_extra_large_clamp": (0.00039, 0.01041, -0.00016),
-    "061_foam_brick": (8e-05, -8e-05, 0.00824),
-}
 
 
 @dataclass(frozen=True, eq=False)
@@ -157,16 +134,15 @@ class BopReader(BaseReader):
 
     def native_from_mesh(self, name: str) -> np.ndarray:
         """Return BOP's object frame from the mesh file's.  -> (4, 4) [m], not millimeters."""
-        out = np.eye(4)
-        if self._mesh_frame == "original":
-            if name not in _YCBV_CENTERS:
-                raise UserError(
-                    f"{name}: no relation between a google_16k mesh and BOP's frame "
-                    f"is known; use BOP's models"
-                )
-            out = ycb.ycbvideo_from_original(name)
-            out[:3, 3] -= _YCBV_CENTERS[name]
-        return out
+        if self._mesh_frame != "original":
+            return np.eye(4)
+        try:
+            return ycb.bop_from_original(name)
+        except KeyError as error:
+            raise UserError(
+                f"{name}: no relation between a google_16k mesh and BOP's frame is known; use "
+                "BOP's models"
+            ) from error
 
     def check_diameter(self, name: str, diameter: float) -> None:
         """Raise UserError where a dataset that is not YCB-V has another object by the number that
@@ -287,9 +263,8 @@ class BopReader(BaseReader):
             name = self._name(number)
             if name not in self.objects:
                 continue
-            pose = np.eye(4)
-            pose[:3, :3] = numbers(one, "cam_R_m2c", gt_path, (3, 3), where)
-            pose[:3, 3] = numbers(one, "cam_t_m2c", gt_path, (3,), where) * MM
+            rotation = numbers(one, "cam_R_m2c", gt_path, (3, 3), where)
+            pose = rigid(rotation, numbers(one, "cam_t_m2c", gt_path, (3,), where) * MM)
             if not is_rigid(torch.from_numpy(pose), tolerance=2e-3):
                 raise BadData(gt_path, f"'{where}cam_R_m2c' is no rotation")
             camera_from_object = np.linalg.inv(pose) if self._inverted else pose
