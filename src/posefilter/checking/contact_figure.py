@@ -42,9 +42,9 @@ def tile(view: View, fit: Fit, title: str) -> np.ndarray:
     return add_caption(np.concatenate([photo, part.show(colors)], axis=1), text, DETAIL)
 
 
-def write_sheet(path: Path, tiles: Sequence[np.ndarray], columns: int = 3) -> None:
+def write_sheet(path: Path, tiles: Sequence[np.ndarray]) -> None:
     """Write tiles as one PNG, row by row, under what their colors mean."""
-    sheet = canvas.arrange_grid(tiles, columns)
+    sheet = canvas.arrange_grid(tiles, columns=3)
     legend = draw_legend(_ENTRIES, sheet.shape[1], DETAIL)
     canvas.save_image(np.concatenate([legend, sheet]), path)
 

@@ -11,20 +11,17 @@ from posefilter.errors import UserError
 from posefilter.signals import leave_signals_to_parent
 
 
-def spare_cores(max_cores: int = 4) -> int:
-    """Return the number of loader processes: the cores that torch's threads do not use.
+def spare_cores() -> int:
+    """Return the number of loader processes, 4 at most: the cores that torch's threads do not use.
 
     With a GPU that is all but one. The threads of one operation wait for each other, so a process
     that takes the core of one delays all of them.
-
-    Args:
-        max_cores: Largest number.
     """
     cores = (
         len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     )
     busy = 1 if torch.cuda.is_available() else torch.get_num_threads()
-    return max(0, min(max_cores, cores - busy))
+    return max(0, min(4, cores - busy))
 
 
 def count_batches(there: int, limit: int | float) -> int:

@@ -52,17 +52,12 @@ class _Surface(NamedTuple):
     diameter: float
 
 
-def find_symmetries(mesh: Mesh, seed: int = 0) -> list[RotationalSymmetry]:
+def find_symmetries(mesh: Mesh) -> list[RotationalSymmetry]:
     """Return the turns that leave the shape of a mesh as it is; of each, whether the texture too.
 
-    Args:
-        mesh: The mesh [m].
-        seed: Of the surface samples.
-
-    Returns:
-        The turns, the best first; `turns.select` takes a group's generators from them.
+    The best are first; `rotational_symmetries.select` takes a group's generators from them.
     """
-    surface = _sample(mesh, seed)
+    surface = _sample(mesh)
     center = surface.points.mean(0)  # every symmetry leaves the centroid as it is
     found: list[RotationalSymmetry] = []
     for axis in _candidate_axes(mesh, surface.points - center):
@@ -78,10 +73,10 @@ def find_symmetries(mesh: Mesh, seed: int = 0) -> list[RotationalSymmetry]:
     return [turn for turn in kept if not _is_implied(turn, kept)]
 
 
-def _sample(mesh: Mesh, seed: int) -> _Surface:
+def _sample(mesh: Mesh) -> _Surface:
     size = diameter(mesh.vertices)
-    face, weights = sample_surface(mesh, _SAMPLES, seed)
-    many_faces, many_weights = sample_surface(mesh, _DENSE, seed + 1)
+    face, weights = sample_surface(mesh, _SAMPLES, seed=0)
+    many_faces, many_weights = sample_surface(mesh, _DENSE, seed=1)
     points = surface_points(mesh, face, weights)
     dense = surface_points(mesh, many_faces, many_weights)
     a, b, c = (mesh.vertices[mesh.faces[:, i]] for i in range(3))
@@ -152,11 +147,11 @@ def _color_change(surface: _Surface, transform: np.ndarray) -> np.ndarray:
     return np.asarray(np.abs(surface.dense_colors[near].mean(1) - surface.colors).mean(1))
 
 
-def _register(surface: _Surface, transform: np.ndarray, rounds: int = 15) -> np.ndarray:
+def _register(surface: _Surface, transform: np.ndarray) -> np.ndarray:
     """Refine a transform of the surface onto itself: closest points (Besl and McKay 1992), the
     farthest tenth left out.
     """
-    for _ in range(rounds):
+    for _ in range(15):
         moved = move(surface.points, transform)
         distance, near = surface.nearest.query(moved)
         kept = distance <= np.quantile(distance, 0.9)

@@ -26,10 +26,6 @@ _PART_POINTS = 300  # of a part's surface, beside the vertices of its hull
 LOOKALIKE = "lookalike_"
 
 
-def _identity() -> np.ndarray:
-    return np.eye(4)[None]
-
-
 @dataclass(frozen=True, eq=False)
 class Mesh:
     """A textured triangle mesh in its file's own frame [m].  Treat the arrays as read-only.
@@ -47,7 +43,7 @@ class Mesh:
     corner_colors: np.ndarray | None  # (F, 3, 3) float32 in [0, 1]; None without vertex colors
     corner_normals: np.ndarray  # (F, 3, 3) float32, unit
     # (S, 4, 4) object_from_object, the identity first
-    symmetries: np.ndarray = field(default_factory=_identity)
+    symmetries: np.ndarray = field(default_factory=lambda: np.eye(4)[None])
     # (F,) bool by part: the faces of each, disjoint; see meshes/parts.py
     parts: Mapping[str, np.ndarray] = field(default_factory=dict)
     # (V,) each vertex's number in its file, which may have others that no face uses; None: the same
@@ -216,9 +212,7 @@ def hull_vertices(vertices: np.ndarray) -> np.ndarray:
         ) from error
 
 
-def outline_hull(
-    vertices: np.ndarray, max_vertices: int = _HULL_VERTICES, error: float = _HULL_ERROR
-) -> np.ndarray:
+def outline_hull(vertices: np.ndarray, max_vertices: int = _HULL_VERTICES) -> np.ndarray:
     """Select few hull vertices that have nearly the same outline.
 
     A silhouette is bounded by support functions h(d) = max x . d. Greedily, the direction is found
@@ -229,7 +223,6 @@ def outline_hull(
     Args:
         vertices: (V, 3) [m].
         max_vertices: Largest number of vertices.
-        error: Stop where no direction is further below than this [m].
 
     Returns:
         (<= max_vertices, 3) [m].
@@ -246,7 +239,7 @@ def outline_hull(
     have = reach[chosen].max(axis=0)
     while len(chosen) < max_vertices:
         worst = int(np.argmax(target - have))
-        if target[worst] - have[worst] < error:
+        if target[worst] - have[worst] < _HULL_ERROR:
             break
         chosen.append(int(best[worst]))
         have = np.maximum(have, reach[chosen[-1]])

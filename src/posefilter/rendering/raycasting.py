@@ -112,11 +112,10 @@ class RayCaster:
         rays: np.ndarray,
         instances: Sequence[Instance],
         lights: Lights,
-        stride: int = 3,
     ) -> np.ndarray:
         """Compute how much of the first light reaches each pixel.
 
-        Rays are cast from every `stride`-th pixel and the result is smoothed: an extended light has
+        Rays are cast from every third pixel and the result is smoothed: an extended light has
         soft shadows.
 
         Args:
@@ -124,11 +123,11 @@ class RayCaster:
             rays: (H, W, 3) of all pixels.
             instances: What casts shadows.
             lights: The first of them casts shadows.
-            stride: Distance of the pixels that are computed.
 
         Returns:
             (H, W) float32 in [0, 1].
         """
+        stride = 3
         coarse = (slice(None, None, stride), slice(None, None, stride))
         points = rays[coarse] * surfaces.depth[coarse][..., None] + 0.002 * surfaces.normal[coarse]
         shape = points.shape[:2]

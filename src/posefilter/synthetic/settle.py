@@ -34,19 +34,11 @@ def load_mujoco() -> Any:
     return mujoco
 
 
-def settle(
-    placed: Sequence[Placed], table: Table, rng: np.random.Generator, dropped: float = 0.5
-) -> list[Placed]:
-    """Simulate objects until they rest.
+def settle(placed: Sequence[Placed], table: Table, rng: np.random.Generator) -> list[Placed]:
+    """Simulate objects, the target first, until they rest; leave out those that left the table, but
+    for the target.
 
-    Args:
-        placed: The objects, the target first.
-        table: The table.
-        rng: Source of randomness.
-        dropped: Fraction of the others that fall from up to 12 cm in a random rotation.
-
-    Returns:
-        The objects at rest, without those that left the table; the target always stays.
+    Half of the others fall from up to 12 cm in a random rotation.
 
     Raises:
         UserError: mujoco is missing.
@@ -54,7 +46,7 @@ def settle(
     mujoco = load_mujoco()
     start = [
         placed[0],
-        *(_drop(one, placed, table, rng) if rng.random() < dropped else one for one in placed[1:]),
+        *(_drop(one, placed, table, rng) if rng.random() < 0.5 else one for one in placed[1:]),
     ]
     spot_from_camera = np.linalg.inv(table.camera_from_spot)
     model = mujoco.MjModel.from_xml_string(_world([one.solid for one in start]))

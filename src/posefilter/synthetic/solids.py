@@ -31,7 +31,7 @@ def make_solid(mesh: Mesh) -> Solid:
     )
 
 
-def find_stable_rotations(hull: np.ndarray, directions: int = 200) -> tuple[np.ndarray, np.ndarray]:
+def find_stable_rotations(hull: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Find the rotations in which a convex body lies stably.
 
     They are local minima of the height of the center of mass (taken as the center of the box) over
@@ -39,12 +39,12 @@ def find_stable_rotations(hull: np.ndarray, directions: int = 200) -> tuple[np.n
 
     Args:
         hull: (V, 3) vertices [m].
-        directions: How many directions descend.
 
     Returns:
         Rotations (R, 3, 3) that turn the direction of each minimum down, and the fraction of the
         directions that ended there (R,).
     """
+    directions = 200
     down = fibonacci_sphere(directions)
     body = hull - (hull.min(0) + hull.max(0)) / 2
     rng = np.random.default_rng(0)

@@ -100,11 +100,11 @@ def need(record: Any, key: str, path: Path, where: str = "") -> Any:
     return record[key]
 
 
-def need_list(record: Any, key: str, path: Path, where: str = "") -> list[Any]:
+def need_list(record: Any, key: str, path: Path) -> list[Any]:
     """Return record[key].  Raises BadData where it is missing, or no list of mappings."""
-    value = need(record, key, path, where)
+    value = need(record, key, path)
     if not (isinstance(value, list) and all(isinstance(one, dict) for one in value)):
-        raise BadData(path, f"'{where}{key}' is no list of records", f"found {str(value)[:40]}")
+        raise BadData(path, f"'{key}' is no list of records", f"found {str(value)[:40]}")
     return value
 
 

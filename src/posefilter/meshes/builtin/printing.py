@@ -23,11 +23,10 @@ _FONT = cv2.FONT_HERSHEY_DUPLEX
 class Canvas:
     """An image with coordinates in millimeters."""
 
-    def __init__(
-        self, width_mm: float, height_mm: float, color: Color, px_per_mm: float = 3.0
-    ) -> None:
-        self.width_mm, self.height_mm, self.px = width_mm, height_mm, px_per_mm
-        shape = (max(1, round(height_mm * px_per_mm)), max(1, round(width_mm * px_per_mm)), 3)
+    px = 3.0  # a millimeter
+
+    def __init__(self, width_mm: float, height_mm: float, color: Color) -> None:
+        shape = (max(1, round(height_mm * self.px)), max(1, round(width_mm * self.px)), 3)
         self.image = np.full(shape, color, dtype=np.uint8)
 
     def _at(self, x_mm: float, y_mm: float) -> tuple[int, int]:

@@ -59,11 +59,9 @@ def _metal_lid(radius_mm: float) -> Canvas:
     return page
 
 
-def _can(
-    name: str, radius: float, height: float, side: Canvas, lid: Canvas, rim: float = 0.0012
-) -> Mesh:
+def _can(name: str, radius: float, height: float, side: Canvas, lid: Canvas) -> Mesh:
     """Make a can: rims, a sunken lid and base."""
-    inner = radius - rim
+    inner = radius - 0.0012
     wall: Profile = [
         (radius, 0),
         (radius, 0.002),
