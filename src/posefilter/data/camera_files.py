@@ -20,19 +20,12 @@ _SIZES = (("width", "height"), ("image_width", "image_height"), ("w", "h"))
 
 
 class CameraFile(NamedTuple):
-    """What a file says of a camera.
+    """What a file says of a camera."""
 
-    Attributes:
-        K: Camera matrix (3, 3), float64 [px].
-        size: Height and width of its images [px], where the file says so.
-        distortion: Of its lens, in OpenCV's order; empty where there is none.
-        rectified: Camera matrix of its rectified images, where the file has one.
-    """
-
-    K: np.ndarray
-    size: tuple[int, int] | None = None
-    distortion: tuple[float, ...] = ()
-    rectified: np.ndarray | None = None
+    K: np.ndarray  # camera matrix (3, 3), float64 [px]
+    size: tuple[int, int] | None = None  # height and width of its images [px], if they are told
+    distortion: tuple[float, ...] = ()  # of its lens, in OpenCV's order
+    rectified: np.ndarray | None = None  # (3, 3) of its rectified images, where the file has one
 
 
 def read_camera_file(path: Path) -> CameraFile:

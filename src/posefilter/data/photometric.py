@@ -26,25 +26,17 @@ class ColorResponse:
 
     Applied are, in this order: a gamma curve, and one 3 x 3 matrix, the product of a tint, a mixing
     of channels and a rotation of hue.
-
-    Attributes:
-        hue_deg: standard deviation of the rotation about the gray axis [degrees].
-        mixing: standard deviation of the off-diagonal entries of the mixing matrix.
-        tint: standard deviation of the logarithm of each channel's gain.
-        gamma: standard deviation of the logarithm of the exponent.
-        gain: range of the gain that all channels share, uniform in its logarithm.
-        target: "image", or "object" for the pixels of the mask alone, as faded or retouched print
-            has it.
-        probability: share of samples that are changed.
     """
 
+    # standard deviations: of the rotation about the gray axis, of the mixing matrix's off-diagonal
+    # entries, of the logarithms of each channel's gain and of the exponent
     hue_deg: float = 14.0
     mixing: float = 0.12
     tint: float = 0.12
     gamma: float = 0.2
-    gain: tuple[float, float] = (1.0, 1.0)
-    target: str = "image"
-    probability: float = 1.0
+    gain: tuple[float, float] = (1.0, 1.0)  # range, of all channels, uniform in its logarithm
+    target: str = "image"  # "object": the mask's pixels alone, as faded or retouched print has it
+    probability: float = 1.0  # share of samples that are changed
 
     def __post_init__(self) -> None:
         if self.target not in ("image", "object"):
@@ -87,11 +79,9 @@ class Vignette:
 
 @dataclasses.dataclass(frozen=True)
 class Highlights:
-    """Overexpose: brighten so that the brightest areas are clipped.  gain: scale of the half-normal
-    log gain.
-    """
+    """Overexpose: brighten so that the brightest areas are clipped."""
 
-    gain: float = 0.2
+    gain: float = 0.2  # scale of the half-normal log gain
     probability: float = 0.3
 
     def __call__(self, sample: Sample, draw: Draw, rng: Generator) -> Sample:
@@ -104,11 +94,9 @@ class Highlights:
 
 @dataclasses.dataclass(frozen=True)
 class MotionBlur:
-    """Blur along a line, as a moving camera does.  length: the longest line, as a share of the
-    image width.
-    """
+    """Blur along a line, as a moving camera does."""
 
-    length: float = 0.02
+    length: float = 0.02  # of the longest line, as a share of the image width
     probability: float = 0.2
 
     def __call__(self, sample: Sample, draw: Draw, rng: Generator) -> Sample:
@@ -124,11 +112,9 @@ class MotionBlur:
 
 @dataclasses.dataclass(frozen=True)
 class Jpeg:
-    """Compress the image as a JPEG of a quality drawn from a range (100 is best), and read it
-    back.
-    """
+    """Compress the image as a JPEG, and read it back."""
 
-    quality: tuple[int, int] = (40, 95)
+    quality: tuple[int, int] = (40, 95)  # range; 100 is best
     probability: float = 0.3
 
     def __call__(self, sample: Sample, draw: Draw, rng: Generator) -> Sample:
@@ -147,18 +133,12 @@ class Sticker:
     """Stick a printed label on the object: real objects carry labels that their meshes lack.
 
     The label is a rotated rectangle, cut off where the object ends; it still belongs to the object.
-
-    Attributes:
-        probability: share of samples with a label.
-        size: range of its sides, as a share of the square root of the object's visible area.
-        white: share of labels that are nearly white; the others have any color.
-        printed: share of labels with dark bars.
     """
 
-    probability: float = 0.4
-    size: tuple[float, float] = (0.15, 0.5)
-    white: float = 0.7
-    printed: float = 0.5
+    probability: float = 0.4  # share of samples with a label
+    size: tuple[float, float] = (0.15, 0.5)  # of its sides, in roots of the object's visible area
+    white: float = 0.7  # share of labels that are nearly white; the others have any color
+    printed: float = 0.5  # share of labels with dark bars
 
     def __call__(self, sample: Sample, draw: Draw, rng: Generator) -> Sample:
         """Return the sample with or without a label."""

@@ -24,25 +24,15 @@ _COARSE = 0.5  # [px / mm] of texture
 
 
 class MeshFacts(NamedTuple):
-    """What is known of a mesh.
+    """What is known of a mesh."""
 
-    Attributes:
-        diameter_mm: Largest distance between two points.
-        size_mm: Of the box along the file's axes.
-        faces: Number of triangles.
-        open_edges: Share of the edges that do not belong to two triangles.
-        volume_cm3: Of a closed surface.
-        texture_px_per_mm: Of the texture on the surface; 0 without texture.
-        colored: Whether texture or vertices have more than one color.
-    """
-
-    diameter_mm: float
-    size_mm: tuple[float, float, float]
+    diameter_mm: float  # largest distance between two points
+    size_mm: tuple[float, float, float]  # of the box along the file's axes
     faces: int
-    open_edges: float
-    volume_cm3: float
-    texture_px_per_mm: float
-    colored: bool
+    open_edges: float  # share of the edges that do not belong to two triangles
+    volume_cm3: float  # of a closed surface
+    texture_px_per_mm: float  # of the texture on the surface; 0 without texture
+    colored: bool  # whether texture or vertices have more than one color
 
 
 def inspect_mesh(mesh: Mesh) -> MeshFacts:

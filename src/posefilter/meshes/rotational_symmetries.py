@@ -16,28 +16,17 @@ _SMALLEST = np.deg2rad(25.0)  # turn in a group of turns by a quarter and more
 
 
 class RotationalSymmetry(NamedTuple):
-    """A turn that was tried, and how well it fits.
+    """A turn that was tried, and how well it fits."""
 
-    Attributes:
-        axis: (3,) unit vector.
-        point: (3,) a point on the axis [m].
-        fold: 2, 3 or 4 for turns by that part of a circle, 0 for any.
-        distance: Mean distance of the turned surface to the surface, less that of two samplings
-            [m].
-        far: The same of the distance that a fiftieth of the samples exceed [m].
-        color: Color difference that a twentieth of the samples exceed, in [0, 1].
-        shape: Whether the shape is the same.
-        texture: Whether shape and texture are.
-    """
-
-    axis: np.ndarray
-    point: np.ndarray
-    fold: int
+    axis: np.ndarray  # (3,) unit vector
+    point: np.ndarray  # (3,) on the axis [m]
+    fold: int  # 2, 3 or 4 for turns by that part of a circle, 0 for any
+    # mean distance of the turned surface to the surface, less that of two samplings [m]
     distance: float
-    far: float
-    color: float
-    shape: bool
-    texture: bool
+    far: float  # the same of the distance that a fiftieth of the samples exceed [m]
+    color: float  # difference that a twentieth of the samples exceed, in [0, 1]
+    shape: bool  # whether the shape is the same
+    texture: bool  # whether shape and texture are
 
 
 def select(turns: Sequence[RotationalSymmetry], texture: bool = True) -> list[RotationalSymmetry]:

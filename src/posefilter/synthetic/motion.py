@@ -28,21 +28,14 @@ _SLIDE = 3  # frames in which the cover comes before the object, and in which it
 class MotionSettings:
     """How the frames of a scene follow each other.
 
-    Attributes:
-        moves: "none": each frame is arranged anew; "camera", "object" or "both".
-        translation_mm: Root mean square, from one frame to the next, of what moves [mm].
-        rotation_deg: The same [degrees].
-        fully_occluded_frames: Frames in a row, in the middle of each scene, in which the object is
-            hidden.
-
     Raises:
         UserError: A value is wrong.
     """
 
-    moves: str = "none"
-    translation_mm: float = 5.0
-    rotation_deg: float = 1.0
-    fully_occluded_frames: int = 0
+    moves: str = "none"  # each frame is arranged anew; or "camera", "object", "both"
+    translation_mm: float = 5.0  # root mean square, from one frame to the next, of what moves
+    rotation_deg: float = 1.0  # the same
+    fully_occluded_frames: int = 0  # in a row, in the middle of each scene: the object is hidden
 
     def __post_init__(self) -> None:
         """Check the choice."""
