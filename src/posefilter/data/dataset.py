@@ -108,12 +108,7 @@ class EpochShuffle(Sampler[int]):
     """
 
     def __init__(
-        self,
-        length: int,
-        seed: int,
-        tell: Callable[[int], None],
-        rank: int = 0,
-        processes: int = 1,
+        self, length: int, seed: int, tell: Callable[[int], None], rank: int = 0, processes: int = 1
     ) -> None:
         if length == 0:
             raise UserError(

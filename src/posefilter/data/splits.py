@@ -121,10 +121,7 @@ def _image(record: FrameRecord) -> tuple[str, int]:
 
 
 def _divide_images(
-    records: Sequence[FrameRecord],
-    scenes: set[str],
-    fractions: Mapping[str, float],
-    root: Path,
+    records: Sequence[FrameRecord], scenes: set[str], fractions: Mapping[str, float], root: Path
 ) -> dict[tuple[str, int], str]:
     """Return the split of each image: blocks of neighbors, since neighbors are alike."""
     images = sorted({_image(record) for record in records if record.group in scenes})

@@ -87,14 +87,7 @@ def _sample(mesh: Mesh) -> _Surface:
     colors = surface_colors(mesh, many_faces, many_weights)
     near = sides.query(np.concatenate([points, normals[face]], axis=1), k=16)[1]
     return _Surface(
-        points,
-        normals[face],
-        dense,
-        cKDTree(dense),
-        sides,
-        colors,
-        colors[near].mean(1),
-        size,
+        points, normals[face], dense, cKDTree(dense), sides, colors, colors[near].mean(1), size
     )
 
 

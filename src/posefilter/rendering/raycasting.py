@@ -107,11 +107,7 @@ class RayCaster:
         return Hits(pixel[hit], out["tfar"][hit], out["u"][hit], out["v"][hit], out["primID"][hit])
 
     def shadow(
-        self,
-        surfaces: Surfaces,
-        rays: np.ndarray,
-        instances: Sequence[Instance],
-        lights: Lights,
+        self, surfaces: Surfaces, rays: np.ndarray, instances: Sequence[Instance], lights: Lights
     ) -> np.ndarray:
         """Compute how much of the first light reaches each pixel.
 

@@ -76,8 +76,7 @@ class Scenario:
         turn = whole[:3, :3]
         ways = [turn @ np.array(way) for way in self.layout.lights.directions]
         lights = replace(
-            self.layout.lights,
-            directions=tuple((float(x), float(y), float(z)) for x, y, z in ways),
+            self.layout.lights, directions=tuple((float(x), float(y), float(z)) for x, y, z in ways)
         )
         cover = self._place_cover(frame, placed[0])
         planes = planes if cover is None else (*planes, cover)

@@ -10,13 +10,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from posefilter.data.readers.decode import (
-    list_folder,
-    need,
-    need_list,
-    numbers,
-    whole_number,
-)
+from posefilter.data.readers.decode import list_folder, need, need_list, numbers, whole_number
 from posefilter.errors import BadData, UserError
 from posefilter.geometry.pose import is_rigid
 from posefilter.geometry.rigid import rigid

@@ -11,13 +11,7 @@ import torch
 
 from posefilter.data.frames import FrameRecord, NotShown, Sample
 from posefilter.data.readers.base import BaseReader
-from posefilter.data.readers.decode import (
-    expect_size,
-    numbers,
-    read_color,
-    read_depth,
-    read_label,
-)
+from posefilter.data.readers.decode import expect_size, numbers, read_color, read_depth, read_label
 from posefilter.data.readers.naming import choose_objects, choose_several, need_text
 from posefilter.data.readers.plausible import check_camera, check_units
 from posefilter.data.readers.ycb_video_files import (

@@ -9,9 +9,7 @@ from typing import Any, Literal
 
 import scipy.io
 
-from posefilter.data.readers.decode import (
-    list_folder,
-)
+from posefilter.data.readers.decode import list_folder
 from posefilter.errors import BadData, UserError
 from posefilter.limits import read_bytes, read_lines
 from posefilter.meshes import ycb
