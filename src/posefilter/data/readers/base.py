@@ -114,22 +114,18 @@ class BaseReader:
         sample = Sample(rgb, depth, mask, narrow(K), narrow(pose), object_id, i, unknown)
         return check_sample(sample, pose @ np.linalg.inv(native_from_mesh), files)
 
-    def _instance(
-        self,
-        name: str,
-        poses: tuple[np.ndarray, ...],
-        which: int,
-        K: np.ndarray,
-        mask: np.ndarray,
-        path: Path,
-    ) -> np.ndarray:
-        """Return one instance's part of a mask that several instances of a class share.
+    def _own_part(self, entry: Any, K: np.ndarray, mask: np.ndarray) -> np.ndarray:
+        """Return an instance's part of a class's mask, which others in the image (its `twins`) may
+        share.
 
-        Raises BadData without a mesh.
+        Raises BadData where they do, and no mesh fits.
         """
-        parts = None if self._geometry is None else self._geometry.instances(name, poses, K, mask)
+        if len(entry.twins) == 1:
+            return mask
+        name, parts = entry.record.object, None
+        if self._geometry is not None:
+            parts = self._geometry.instances(name, entry.twins, K, mask)
         if parts is None:
-            raise BadData(
-                path, "two instances of one class, and no mesh that fits to tell them apart", name
-            )
-        return parts[which]
+            why = "two instances of one class, and no mesh that fits to tell them apart"
+            raise BadData(entry.record.files[2], why, name)
+        return parts[entry.twin]

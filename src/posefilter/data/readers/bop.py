@@ -202,9 +202,8 @@ class BopReader(BaseReader):
         return out & ~mask
 
     def _name(self, number: int) -> str:
-        if self._by_ycb_name and 1 <= number <= len(ycb.CLASSES):
-            return ycb.CLASSES[number - 1]
-        return f"obj_{number:06d}"
+        known = self._by_ycb_name and 1 <= number <= len(ycb.CLASSES)
+        return ycb.CLASSES[number - 1] if known else f"obj_{number:06d}"
 
     def _read_scene(self, folder: Path) -> tuple[dict[str, Any], dict[str, Any]]:
         """Return a scene's truth and cameras by image, both empty where they are broken and
@@ -252,9 +251,11 @@ class BopReader(BaseReader):
         camera = need(cameras, str(int(image)), camera_path)  # either may be written as 000003
         K = numbers(camera, "cam_K", camera_path, (3, 3), f"{image}.")
         scale = float(numbers(camera, "depth_scale", camera_path, (), f"{image}."))
-        check_units(1 / (scale * MM) if scale > 0 else scale, camera_path, f"{image}.depth_scale")
+        units = 1 / (scale * MM) if scale > 0 else scale
+        check_units(units, camera_path, f"{image}.depth_scale")
         masks = [folder / "mask_visib" / f"{stem}_{k:06d}.png" for k in range(len(truth))]
-        color = _color(folder, stem)
+        subs = ("rgb", "gray")  # where a sensor has no color
+        color = _first(folder / sub / f"{stem}.{end}" for sub in subs for end in _ENDINGS)
         depth = _first(folder / "depth" / f"{stem}.{end}" for end in _DEPTH_ENDINGS)
         entries = []
         for k, one in enumerate(truth):
@@ -273,17 +274,9 @@ class BopReader(BaseReader):
                 f"{group}/{stem}", group, int(folder.name), int(image), number, name, k, files
             )
             siblings = tuple(mask for j, mask in enumerate(masks) if j != k)
-            entries.append(
-                _Entry(
-                    record, K, 1 / (scale * MM), camera_from_object @ self._native[name], siblings
-                )
-            )
+            pose = camera_from_object @ self._native[name]
+            entries.append(_Entry(record, K, units, pose, siblings))
         return entries
-
-
-def _color(folder: Path, stem: str) -> Path:
-    """Return where an image's color is: `rgb`, or `gray` where a sensor has no color."""
-    return _first(folder / sub / f"{stem}.{end}" for sub in ("rgb", "gray") for end in _ENDINGS)
 
 
 def _first(candidates: Iterable[Path]) -> Path:

@@ -141,7 +141,7 @@ class FatReader(BaseReader):
             expect_size(path, image, camera.height, camera.width, "_camera_settings.json")
         if int(seg.max()) > _LARGEST_ID:
             raise BadData(seg_path, "no segment image", f"id {int(seg.max())}; is it the depth?")
-        mask = self._mask(entry, seg, seg_path)
+        mask = self._mask(entry, seg)
         files = (camera_path, json_path, depth_path, seg_path)
         aligned = entry.kind.aligned_from_mesh
         return self._make_sample(i, rgb, depth, mask, camera.K, aligned, files)
@@ -150,28 +150,19 @@ class FatReader(BaseReader):
         """Return the pixels of any other labeled object.  -> (H, W) bool."""
         entry = self._entries[i]
         seg = read_label(self._files(entry.record)[2])
-        return (seg != 0) & ~self._mask(entry, seg, entry.record.files[2])
+        return (seg != 0) & ~self._mask(entry, seg)
 
-    def _mask(self, entry: _Entry, seg: np.ndarray, path: Path) -> np.ndarray:
-        mask = seg == entry.kind.seg_id
-        if len(entry.twins) > 1:
-            mask = self._instance(
-                entry.record.object, entry.twins, entry.twin, entry.camera.K, mask, path
-            )
-        if not mask.any():
-            detail = f"no pixel of {entry.record.object}, id {entry.kind.seg_id}"
-            if (
-                entry.visibility >= _CLEARLY_VISIBLE
-                and len(entry.twins) == 1
-                and _center_in_frame(entry)
-            ):
-                raise BadData(
-                    path,
-                    "empty mask",
-                    f"{detail}, though its JSON says visibility {entry.visibility:.2f}",
-                )
-            raise NotShown(path, "listed, but not in the label", detail)
-        return mask
+    def _mask(self, entry: _Entry, seg: np.ndarray) -> np.ndarray:
+        mask = self._own_part(entry, entry.camera.K, seg == entry.kind.seg_id)
+        if mask.any():
+            return mask
+        path = entry.record.files[2]
+        detail = f"no pixel of {entry.record.object}, id {entry.kind.seg_id}"
+        clear = entry.visibility >= _CLEARLY_VISIBLE and len(entry.twins) == 1
+        if clear and _center_in_frame(entry):
+            detail += f", though its JSON says visibility {entry.visibility:.2f}"
+            raise BadData(path, "empty mask", detail)
+        raise NotShown(path, "listed, but not in the label", detail)
 
     def _settings(self, folder: Path) -> tuple[dict[str, FatClass], dict[str, FatCamera]] | None:
         """Return a folder's classes and cameras, None where they are broken and on_error is

@@ -50,10 +50,7 @@ def scene_folders(root: Path, subsets: set[str], deep: int = 0) -> Iterator[Path
     if deep > _DEEPEST:
         raise UserError(f"{root}: folders nested more than {_DEEPEST} deep; a link to itself?")
     names = list_folder(root)
-    if (
-        any(FRAME.match(name) or IMAGE.match(name) for name in names)
-        or "_object_settings.json" in names
-    ):
+    if "_object_settings.json" in names or any(FRAME.match(n) or IMAGE.match(n) for n in names):
         yield root
         return
     if any(_NEWER.search(name) for name in names):
@@ -62,11 +59,8 @@ def scene_folders(root: Path, subsets: set[str], deep: int = 0) -> Iterator[Path
             f"has .seg.png, .depth.png"
         )
     for name in names:
-        if (
-            (root / name).is_dir()
-            and not name.startswith(".")
-            and (name not in {"single", "mixed"} or name in subsets)
-        ):
+        unwanted = name.startswith(".") or name in {"single", "mixed"} - subsets
+        if not unwanted and (root / name).is_dir():
             yield from scene_folders(root / name, subsets, deep + 1)
 
 
@@ -83,19 +77,14 @@ def object_settings(path: Path) -> dict[str, FatClass]:
     classes = {}
     for k, one in enumerate(need_list(read_json(path), "exported_objects", path)):
         where = f"exported_objects[{k}]."
-        need(one, "fixed_model_transform", path, where)
         F = numbers(one, "fixed_model_transform", path, (4, 4), where)
         aligned = F.T.copy()  # row vectors -> columns
         aligned[:3] *= CM  # x100 in the rotation, centimeters in the translation
         if not is_rigid(torch.from_numpy(aligned), tolerance=2e-3):
-            raise BadData(
-                path,
-                f"'{where}fixed_model_transform' is not 100 x a rotation with its "
-                f"shift in the last row",
-            )
-        size = None
-        if "cuboid_dimensions" in one:
-            size = numbers(one, "cuboid_dimensions", path, (3,), where) * CM
+            wrong = "is not 100 x a rotation with its shift in the last row"
+            raise BadData(path, f"'{where}fixed_model_transform' {wrong}")
+        sized = "cuboid_dimensions" in one
+        size = numbers(one, "cuboid_dimensions", path, (3,), where) * CM if sized else None
         seg_id = whole_number(one, "segmentation_class_id", path, where)
         classes[mesh_name(need(one, "class", path, where), path)] = FatClass(seg_id, aligned, size)
     return classes
@@ -106,23 +95,19 @@ def camera_settings(path: Path) -> dict[str, FatCamera]:
     cameras = {}
     for k, one in enumerate(need_list(read_json(path), "camera_settings", path)):
         where = f"camera_settings[{k}]."
-        inner = need(one, "intrinsic_settings", path, where)
+        inner, inside = need(one, "intrinsic_settings", path, where), f"{where}intrinsic_settings."
         fx, fy, cx, cy = (
-            float(numbers(inner, key, path, (), f"{where}intrinsic_settings."))
-            for key in ("fx", "fy", "cx", "cy")
+            float(numbers(inner, key, path, (), inside)) for key in ("fx", "fy", "cx", "cy")
         )
         size = need(one, "captured_image_size", path, where)
         width, height = (
             whole_number(size, key, path, f"{where}captured_image_size.")
             for key in ("width", "height")
         )
-        skew = 0.0
-        if "s" in inner:
-            skew = float(numbers(inner, "s", path, (), f"{where}intrinsic_settings."))
+        skew = float(numbers(inner, "s", path, (), inside)) if "s" in inner else 0.0
         if not (0 < width <= MOST_SIDE and 0 < height <= MOST_SIDE):
-            raise BadData(
-                path, "no such image size", f"{where}captured_image_size {width}x{height}"
-            )
+            found = f"{where}captured_image_size {width}x{height}"
+            raise BadData(path, "no such image size", found)
         K = np.array([[fx, skew, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
         cameras[str(need(one, "name", path, where))] = FatCamera(K, height, width)
     return cameras
@@ -133,8 +118,7 @@ def camera_from_aligned(record: Any, path: Path, where: str) -> np.ndarray:
     quat = numbers(record, "quaternion_xyzw", path, (4,), where)
     norm = math.hypot(*quat)  # of huge numbers infinite, where a sum of squares would warn
     if abs(norm - 1) > 0.01:  # four decimals leave it 1e-4 off
-        raise BadData(
-            path, f"'{where}quaternion_xyzw' is not a unit quaternion", f"norm {norm:.3g}"
-        )
+        wrong = f"'{where}quaternion_xyzw' is not a unit quaternion"
+        raise BadData(path, wrong, f"norm {norm:.3g}")
     rotation = matrix_from_quat_xyzw(torch.from_numpy(quat / norm)).numpy()
     return rigid(rotation, numbers(record, "location", path, (3,), where) * CM)

@@ -139,14 +139,9 @@ class YCBVideoReader(BaseReader):
     def _mask(self, entry: _Entry, label: np.ndarray) -> np.ndarray:
         path = entry.record.files[2]
         if int(label.max()) > len(self._classes):
-            raise BadData(
-                path,
-                "unknown class",
-                f"label {int(label.max())}, but there are {len(self._classes)} classes",
-            )
-        mask = label == entry.label
-        if len(entry.twins) > 1:
-            mask = self._instance(entry.record.object, entry.twins, entry.twin, entry.K, mask, path)
+            found = f"label {int(label.max())}, but there are {len(self._classes)} classes"
+            raise BadData(path, "unknown class", found)
+        mask = self._own_part(entry, entry.K, label == entry.label)
         if not label.any():
             raise BadData(path, "empty mask", "no object at all in the label image")
         if not mask.any():
@@ -213,17 +208,9 @@ class YCBVideoReader(BaseReader):
             raise BadData(path, "'cls_indexes' is not numbers", str(error)) from error
         if len(indices) == 0:
             return []
-        if (
-            not np.isfinite(indices).all()
-            or (indices != np.round(indices)).any()
-            or indices.min() < 1
-            or indices.max() > len(self._classes)
-        ):
-            raise BadData(
-                path,
-                "unknown class",
-                f"cls_indexes {indices.tolist()}, but there are {len(self._classes)} classes",
-            )
+        if not np.isin(indices, np.arange(1, len(self._classes) + 1)).all():
+            found = f"cls_indexes {indices.tolist()}, but there are {len(self._classes)} classes"
+            raise BadData(path, "unknown class", found)
         classes = [self._classes[int(k) - 1] for k in indices]
         if not set(classes) & set(self.objects):
             return []
@@ -244,11 +231,8 @@ class YCBVideoReader(BaseReader):
             scene = name.rsplit("/", 1)[0]
             group = f"{scene}/{im_id // _SYN_BLOCK}" if scene == SYNTHETIC else scene
             record = FrameRecord(name, group, scene_id, im_id, int(indices[k]), each, k, files)
-            entries.append(
-                _Entry(
-                    record, int(indices[k]), K, units, twins[same.index(k)], twins, same.index(k)
-                )
-            )
+            twin = same.index(k)
+            entries.append(_Entry(record, int(indices[k]), K, units, twins[twin], twins, twin))
         return entries
 
     def _in_mesh_frame(self, camera_from_native: np.ndarray, name: str, path: Path) -> np.ndarray:
