@@ -35,21 +35,16 @@ def find_warnings(
     """
     height, width = depth.shape
     x, y, z = (pose[:3, :3] @ object_model.center.double().numpy() + pose[:3, 3]).tolist()
-    found = []
+    found, scale = [], "is the depth in the right units (depth_scale)?"
     known = float((depth > 0).mean())
     if known < _FEWEST:
         found.append(f"only {100 * known:.1f} % of the pixels have depth")
     some = depth[::4, ::4]
     median = float(np.median(some[some > 0])) if (some > 0).any() else np.inf
-    if median < _NEAREST:
+    if median < _NEAREST or _FARTHEST < median < np.inf:
+        where = "nearer" if median < _NEAREST else "farther"
         found.append(
-            f"the median depth is {median:.2g} m, nearer than most depth cameras measure: is the "
-            "depth in the right units (depth_scale)?"
-        )
-    elif _FARTHEST < median < np.inf:
-        found.append(
-            f"the median depth is {median:.2g} m, farther than most depth cameras measure: is the "
-            "depth in the right units (depth_scale)?"
+            f"the median depth is {median:.2g} m, {where} than most depth cameras measure: {scale}"
         )
     off = np.abs(intrinsics[:2, 2] / (width, height) - 0.5)
     from_swapped = np.abs(intrinsics[:2, 2] - 0.5 * np.array([height, width])) / (width, height)
@@ -72,7 +67,6 @@ def find_warnings(
         return (*found, "the object would be behind the camera")
     focal = float(np.sqrt(intrinsics[0, 0] * intrinsics[1, 1]))
     pixels = object_model.diameter * focal / z
-    scale = "is the depth in the right units (depth_scale)?"
     if pixels < _SMALLEST:
         found.append(
             f"at {z:.2f} m the object would be {pixels:.0f} pixels large, too small to be told "

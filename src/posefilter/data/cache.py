@@ -103,9 +103,7 @@ class DiskCache:
                 self._records[record.key] = _read_prepared(path)
             # a damaged archive, a header that lies of its array: their readers raise anything
             except Exception as error:
-                raise UserError(
-                    f"{path}: a damaged file of the cache; delete {self.folder}"
-                ) from error
+                raise self._damaged(path) from error
         return self._records[record.key]
 
     def keep(self, record: FrameRecord, sample: Sample) -> Prepared:
@@ -135,11 +133,14 @@ class DiskCache:
             raise UserError(f"{record.files[0]}: changed while it was in use; start again")
         path, (height, width) = self._image_path(record), one.shape
         if path.stat().st_size > 5 * height * width + _HEADER:
-            raise UserError(f"{path}: a damaged file of the cache; delete {self.folder}")
+            raise self._damaged(path)
         try:
             return unpack(np.load(path), one, frame_id)
         except Exception as error:  # as above
-            raise UserError(f"{path}: a damaged file of the cache; delete {self.folder}") from error
+            raise self._damaged(path) from error
+
+    def _damaged(self, path: Path) -> UserError:
+        return UserError(f"{path}: a damaged file of the cache; delete {self.folder}")
 
     def _image_path(self, record: FrameRecord) -> Path:
         return self._path(record.name, _stamp(record, 2), ".npy")
@@ -185,14 +186,8 @@ def prepare(sample: Sample) -> Prepared:
     """Return what is kept of a sample beside its image."""
     height, width = sample.mask.shape
     pose, K = sample.camera_from_object.astype(np.float32), sample.intrinsics.astype(np.float32)
-    return Prepared(
-        np.packbits(sample.mask),
-        (height, width),
-        K,
-        pose,
-        sample.object_id,
-        float(sample.visibility),
-    )
+    bits, visibility = np.packbits(sample.mask), float(sample.visibility)
+    return Prepared(bits, (height, width), K, pose, sample.object_id, visibility)
 
 
 def pack_image(sample: Sample) -> np.ndarray:
@@ -209,16 +204,8 @@ def unpack(image: np.ndarray, one: Prepared, frame_id: int) -> Sample:
     rgb = rgb.reshape(height, width, 3).copy()
     depth = depth.view("<u2").reshape(height, width) / np.float32(_UNITS)
     mask = np.unpackbits(one.mask_bits, count=height * width).reshape(height, width).astype(bool)
-    return Sample(
-        rgb,
-        depth,
-        mask,
-        one.intrinsics.copy(),
-        one.camera_from_object.copy(),
-        one.object_id,
-        frame_id,
-        one.visibility,
-    )
+    K, pose = one.intrinsics.copy(), one.camera_from_object.copy()
+    return Sample(rgb, depth, mask, K, pose, one.object_id, frame_id, one.visibility)
 
 
 def _read_prepared(path: Path) -> Prepared:
@@ -234,9 +221,8 @@ def _read_prepared(path: Path) -> Prepared:
         bits, visibility = kept["mask_bits"], float(kept["visibility"])
         if len(bits) != -(-height * width // 8):
             raise ValueError("its mask is not of the image's size")
-        return Prepared(
-            bits, (height, width), kept["intrinsics"], kept["pose"], object_id, visibility
-        )
+        K, pose = kept["intrinsics"], kept["pose"]
+        return Prepared(bits, (height, width), K, pose, object_id, visibility)
 
 
 def _stamp(record: FrameRecord, files: int | None = None) -> str:

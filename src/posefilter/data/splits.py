@@ -4,9 +4,10 @@ anything is learned.
 
 import fnmatch
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Hashable, Mapping, Sequence
+from itertools import islice
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -18,6 +19,7 @@ from posefilter.paths import find_list
 log = logging.getLogger(__name__)
 
 NAMES = ("train", "val", "test")
+_Thing = TypeVar("_Thing", bound=Hashable)
 Share = float | str | Sequence[str]  # of the scenes; a file that lists frames; scenes by name
 
 
@@ -146,24 +148,21 @@ def _divide_images(
         root,
         parts,
     )
-    counts = _counts(len(images), fractions)
-    owner, at = {}, 0
-    for name in (name for name in NAMES if name in counts):
-        owner.update(dict.fromkeys(images[at : at + counts[name]], name))
-        at += counts[name]
-    return owner
+    return _deal(images, fractions, NAMES)
 
 
 def _divide(scenes: list[str], fractions: Mapping[str, float], seed: int) -> dict[str, str]:
     """Return the split of each scene: every fraction gets one scene at least."""
     order = [scenes[i] for i in np.random.default_rng([seed, 7]).permutation(len(scenes))]
-    counts = _counts(len(scenes), fractions)
-    owner, at = {}, 0
-    # test first: more scenes later leave it alone for longest
-    for name in (name for name in NAMES[::-1] if name in counts):
-        owner.update(dict.fromkeys(order[at : at + counts[name]], name))
-        at += counts[name]
-    return owner
+    return _deal(order, fractions, NAMES[::-1])  # more scenes later leave test alone for longest
+
+
+def _deal(
+    things: Sequence[_Thing], fractions: Mapping[str, float], names: Sequence[str]
+) -> dict[_Thing, str]:
+    """Return the split of each thing: in their order, the first name's share first."""
+    counts, left = _counts(len(things), fractions), iter(things)
+    return {thing: name for name in names for thing in islice(left, counts.get(name, 0))}
 
 
 def _counts(many: int, fractions: Mapping[str, float]) -> dict[str, int]:

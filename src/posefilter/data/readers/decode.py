@@ -1,5 +1,6 @@
 """Decode a dataset's files, and say in one line what is wrong with them."""
 
+import contextlib
 import io
 import math
 import struct
@@ -50,8 +51,7 @@ def read_depth(path: Path, units: float, scaled_floats: bool = False) -> np.ndar
     Raises:
         BadData: The file is not such, or most of its depth is negative.
     """
-    is_array = path.suffix.lower() == ".npy"
-    image = _read_array(path) if is_array else _read_image(path)
+    is_array, image = _is_array(path), _read_numbers(path)
     image = image[..., 0] if image.ndim == 3 and image.shape[2] == 1 else image
     image = image[0] if image.ndim == 3 and image.shape[0] == 1 else image
     if is_array and (image.ndim != 2 or image.dtype.kind not in "fui"):
@@ -67,9 +67,8 @@ def read_depth(path: Path, units: float, scaled_floats: bool = False) -> np.ndar
         if image.dtype.kind == "f" and not scaled_floats:
             return image.astype(np.float32)
     elif image.dtype != np.uint16 or image.ndim != 2:
-        raise BadData(
-            path, "depth is not a 16-bit image of one channel", f"found {image.dtype} {image.shape}"
-        )
+        found = f"found {image.dtype} {image.shape}"
+        raise BadData(path, "depth is not a 16-bit image of one channel", found)
     if not (np.isfinite(units) and units > 0):
         raise BadData(path, "depth scale is not a positive number", f"{units} units a meter")
     return np.where(image == SATURATED, 0, image / np.float32(units)).astype(np.float32)
@@ -77,19 +76,17 @@ def read_depth(path: Path, units: float, scaled_floats: bool = False) -> np.ndar
 
 def holds_meters(path: Path) -> bool:
     """Tell whether a depth file that can be read holds floats, which are meters."""
-    image = _read_array(path) if path.suffix.lower() == ".npy" else _read_image(path)
-    return image.dtype.kind == "f"
+    return _read_numbers(path).dtype.kind == "f"
 
 
 def read_label(path: Path) -> np.ndarray:
     """Read an image of class ids.  -> (H, W) uint8 or uint16."""
-    image = _read_image(path)
+    image = decode_image(read_bytes(path), path)
     if image.ndim == 3 and (image == image[..., :1]).all():
         image = image[..., 0]
     if image.ndim != 2 or image.dtype.kind != "u":
-        raise BadData(
-            path, "label image has more than one channel", f"found {image.dtype} {image.shape}"
-        )
+        found = f"found {image.dtype} {image.shape}"
+        raise BadData(path, "label image has more than one channel", found)
     return image
 
 
@@ -133,9 +130,8 @@ def numbers(
     except (TypeError, ValueError, OverflowError) as error:
         raise BadData(path, f"'{where}{key}' is not numbers", str(error)) from error
     if array.size != int(np.prod(shape)):
-        raise BadData(
-            path, f"'{where}{key}' has the wrong size", f"{array.shape}, expected {shape}"
-        )
+        found = f"{array.shape}, expected {shape}"
+        raise BadData(path, f"'{where}{key}' has the wrong size", found)
     if not np.isfinite(array).all():
         raise BadData(path, f"'{where}{key}' holds NaN or infinity")
     return array.reshape(shape)
@@ -156,8 +152,12 @@ def expect_size(path: Path, image: np.ndarray, height: int, width: int, of: str)
         raise BadData(path, "wrong image size", f"{found}, but {of} says {width}x{height}")
 
 
-def _read_image(path: Path) -> np.ndarray:
-    return decode_image(read_bytes(path), path)
+def _is_array(path: Path) -> bool:
+    return path.suffix.lower() == ".npy"
+
+
+def _read_numbers(path: Path) -> np.ndarray:
+    return _read_array(path) if _is_array(path) else decode_image(read_bytes(path), path)
 
 
 def decode_image(data: bytes, path: Path, mode: int = cv2.IMREAD_UNCHANGED) -> np.ndarray:
@@ -175,10 +175,9 @@ def decode_image(data: bytes, path: Path, mode: int = cv2.IMREAD_UNCHANGED) -> n
     if flaw:
         raise BadData(path, "truncated or corrupt image", flaw)
     check_picture(path, data)
-    try:
+    image = None
+    with contextlib.suppress(cv2.error):
         image = cv2.imdecode(np.frombuffer(data, np.uint8), mode)
-    except cv2.error as error:
-        raise BadData(path, "truncated or corrupt image", "cannot be decoded") from error
     if image is None:
         raise BadData(path, "truncated or corrupt image", "cannot be decoded")
     return image
@@ -212,11 +211,8 @@ def _check_upright(data: bytes, path: Path) -> None:
     with Image.open(io.BytesIO(data)) as image:
         turned = image.getexif().get(ExifTags.Base.Orientation, 1)
     if turned in _TURNS:
-        raise BadData(
-            path,
-            f"is stored turned (EXIF orientation {turned})",
-            "save it as it is shown, with depth and intrinsics to match",
-        )
+        advice = "save it as it is shown, with depth and intrinsics to match"
+        raise BadData(path, f"is stored turned (EXIF orientation {turned})", advice)
 
 
 def _flaw(data: bytes) -> str:
@@ -226,9 +222,7 @@ def _flaw(data: bytes) -> str:
     if not data:
         return "the file is empty"
     if data[:2] == _JPEG:
-        return (
-            "" if data.rfind(b"\xff\xd9", max(len(data) - 4096, 0)) >= 0 else "the JPEG has no end"
-        )
+        return "" if b"\xff\xd9" in data[-4096:] else "the JPEG has no end"
     if data[:8] != _PNG:
         return ""
     at = 8

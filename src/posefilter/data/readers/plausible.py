@@ -110,7 +110,6 @@ def check_sample(sample: Sample, camera_from_native: np.ndarray, files: tuple[Pa
         raise Implausible(truth, "the object cannot be seen where its pose is", where, sample)
     middle = float(np.median(known))
     if not _NEAREST <= middle <= FARTHEST:
-        raise Implausible(
-            depth, "depth is not plausible", f"median {middle:.3g} m; wrong depth scale?", sample
-        )
+        found = f"median {middle:.3g} m; wrong depth scale?"
+        raise Implausible(depth, "depth is not plausible", found, sample)
     return sample
