@@ -237,17 +237,13 @@ class FrameRenderer:
         seen = np.bincount(picture.index.reshape(-1) + 1, minlength=len(layout.placed) + 1)[1:]
         objects = []
         for k, one in enumerate(layout.placed):
-            if one.solid.mesh.name == self.job.object or seen[k] > 0:
+            name, pose = one.solid.mesh.name, one.camera_from_object
+            if name == self.job.object or seen[k] > 0:
                 share = float(seen[k] / max(int(picture.unoccluded[k]), 1))
                 truncated = self._truncated(one.hull)
-                objects.append(
-                    fat.ObjectInFrame(
-                        exported[one.solid.mesh.name], one.camera_from_object, share, truncated
-                    )
-                )
-        return [photo, fat.depth_units(depth), ids[picture.index]], fat.frame_record(
-            objects, self.K, right
-        )
+                objects.append(fat.ObjectInFrame(exported[name], pose, share, truncated))
+        images = [photo, fat.depth_units(depth), ids[picture.index]]
+        return images, fat.frame_record(objects, self.K, right)
 
     def _truncated(self, hull: np.ndarray) -> float:
         """Return the fraction of a hull's outline, by area, that is out of the frame."""

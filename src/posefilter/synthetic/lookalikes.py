@@ -91,18 +91,10 @@ def box(name: str, sides: np.ndarray, faces: Sequence[np.ndarray]) -> Mesh:
             triangles.append([4 * k + j for j in i])
             uv.append(spots[list(i)])
     # the atlas's row 0 is its bottom
-    rows = [np.concatenate(list(faces[3 * row : 3 * row + 3]), axis=1) for row in (1, 0)]
-    atlas = np.concatenate(rows, axis=0)
+    atlas = np.vstack([np.hstack(faces[3:]), np.hstack(faces[:3])])
     vertices, index = np.array(corners), np.array(triangles)
-    return Mesh(
-        name,
-        vertices,
-        index,
-        np.array(uv, np.float32),
-        atlas,
-        None,
-        creased_normals(vertices, index),
-    )
+    normals = creased_normals(vertices, index)
+    return Mesh(name, vertices, index, np.array(uv, np.float32), atlas, None, normals)
 
 
 def _clear_stretch(rng: np.random.Generator) -> np.ndarray:

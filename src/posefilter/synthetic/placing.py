@@ -10,6 +10,7 @@ from posefilter.geometry.rigid import move, rigid
 from posefilter.rendering.surfaces import project
 from posefilter.synthetic.solids import Solid, outline_mask, separated
 
+_ATTEMPTS = 8  # places that are tried for a further instance
 _STRIDE = 8  # [px] of the masks by which occlusion is predicted
 _NEAREST = 0.2  # [m] no object comes nearer to the camera
 _GAP = 0.001  # [m] between objects
@@ -156,8 +157,7 @@ def are_separate(a: Placed, b: Placed) -> bool:
 
 def compute_hiding_size(solid: Solid) -> float:
     """Return the second largest side of a solid's box [m]: at best it hides that much."""
-    low, high = solid.mesh.bounds
-    return float(np.sort(high - low)[1])
+    return float(np.sort(np.ptp(solid.mesh.bounds, axis=0))[1])
 
 
 def place_distractor(
@@ -205,6 +205,32 @@ def place_distractor(
         if error < best_error:
             best, best_error = one, error
     return best
+
+
+def place_copies(
+    target: Placed,
+    count: int,
+    view: View,
+    table: Table | None,
+    wanted: float,
+    largest_truncation: float,
+    rng: np.random.Generator,
+) -> list[Placed] | None:
+    """Find poses for `count` further instances of the target, so that the fraction `wanted` of the
+    first stays visible; return all, the first in front, or None where one finds no place.
+
+    At most `largest_truncation` of an instance's outline may be out of the frame.
+    """
+    placed = [target]
+    for _ in range(count):
+        for _ in range(_ATTEMPTS):
+            one = place_distractor(target.solid, placed, view, table, wanted, False, rng)
+            if one is not None and view.holds(one, largest_truncation):
+                placed.append(one)
+                break
+        else:
+            return None
+    return placed
 
 
 def _draw_on_table(

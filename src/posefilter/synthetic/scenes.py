@@ -14,13 +14,13 @@ from posefilter.geometry.rigid import rigid
 from posefilter.meshes.mesh import LOOKALIKE
 from posefilter.meshes.store import MeshStore
 from posefilter.rendering.surfaces import Instance, Lights, Plane
-from posefilter.synthetic.copies import place_copies
 from posefilter.synthetic.lookalikes import make_lookalike
 from posefilter.synthetic.placing import (
     Placed,
     Table,
     View,
     compute_hiding_size,
+    place_copies,
     place_distractor,
     place_floating_target,
     place_target_on_table,
@@ -125,21 +125,10 @@ def draw_scene_set(
         make_solid(make_lookalike(goal.mesh, name, photos, rng, same)) for name in names
     )
     table, floor, wall = (random_texture(rng, 256, photos, w) for w in (_TABLE, _FLOOR, _FLOOR))
-    tiles = (
-        float(rng.uniform(0.2, 1.2)),
-        float(rng.uniform(0.2, 1.5)),
-        float(rng.uniform(0.4, 2.0)),
-    )
-    half = (float(rng.uniform(0.3, 1.2)), float(rng.uniform(0.3, 1.2)))
-    return SceneSet(
-        goal,
-        distractors,
-        lookalikes,
-        (table, floor, wall),
-        tiles,
-        half,
-        float(rng.uniform(0.3, 0.9)),
-    )
+    tiles = rng.uniform(0.2, 1.2), rng.uniform(0.2, 1.5), rng.uniform(0.4, 2.0)
+    half = rng.uniform(0.3, 1.2), rng.uniform(0.3, 1.2)
+    height, textures = rng.uniform(0.3, 0.9), (table, floor, wall)
+    return SceneSet(goal, distractors, lookalikes, textures, tiles, half, height)
 
 
 def draw_layout(
@@ -166,11 +155,8 @@ def draw_layout(
     view = View(K, height, width)
     occluded = bool(rng.random() < settings.occluded_fraction)
     least = 1 - settings.max_occlusion
-    wanted = (
-        rng.uniform(min(max(0.28, least), 0.6), 0.6)
-        if occluded
-        else rng.uniform(max(0.6, least), 1.0)
-    )
+    low, high = (min(max(0.28, least), 0.6), 0.6) if occluded else (max(0.6, least), 1.0)
+    wanted = rng.uniform(low, high)
     tabletop = bool(rng.random() < settings.tabletop_fraction)
     # not every corner of a table has room in front of the target
     for _ in range(8 if occluded else 1):
@@ -212,9 +198,9 @@ def _draw_objects(
         table = set_table(camera_from_spot, scene.table_half_extent, rng)
     else:
         target = place_floating_target(scene.target, view, distance, rng)
-    if not view.holds(target, settings.largest_truncation):
-        return [], table
     more, largest = settings.instances - 1, settings.largest_truncation
+    if not view.holds(target, largest):
+        return [], table
     placed = place_copies(target, more, view, table, wanted, largest, rng)
     if placed is None:
         return [], table
@@ -228,10 +214,8 @@ def _draw_objects(
             placed.append(one)
     if settings.settle and table is not None:
         placed = settle(placed, table, rng)
-        if (
-            not view.holds(placed[0], settings.largest_truncation)
-            or view.visible(placed) < 1 - settings.max_occlusion
-        ):
+        hidden = view.visible(placed) < 1 - settings.max_occlusion
+        if hidden or not view.holds(placed[0], largest):
             return [], table
     return placed, table
 
@@ -244,10 +228,8 @@ def _draw_solids(scene: SceneSet, settings: SceneSettings, rng: np.random.Genera
     alike = [scene.lookalikes[i] for i in rng.permutation(len(scene.lookalikes))]
     out: list[Solid] = []
     while len(out) < count and (usual or alike):
-        pool = (
-            alike if alike and (not usual or rng.random() < settings.lookalike_fraction) else usual
-        )
-        out.append(pool.pop())
+        look = alike and (not usual or rng.random() < settings.lookalike_fraction)
+        out.append((alike if look else usual).pop())
     return out
 
 

@@ -70,11 +70,8 @@ def simulate_depth(depth: np.ndarray, photo: np.ndarray, rng: np.random.Generato
     out = _jitter_edges(depth, rng)
     valid = out > 0
     fine = blurred_noise(rng, height, width, rng.uniform(0.8, 3) * width / 640)
-    slow = cv2.resize(
-        rng.standard_normal((5, 6), dtype=np.float32),
-        (width, height),
-        interpolation=cv2.INTER_CUBIC,
-    )
+    coarse = rng.standard_normal((5, 6), dtype=np.float32)
+    slow = cv2.resize(coarse, (width, height), interpolation=cv2.INTER_CUBIC)
     out = out * np.float32(1 + rng.normal(0, 0.0025))
     out = out + out * out * (
         fine * np.float32(rng.uniform(0.0004, 0.0022)) + slow * np.float32(0.0012)
@@ -99,12 +96,8 @@ def _blur(image: np.ndarray, sigma: float) -> np.ndarray:
 def _vary_brightness(rgb: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     """Vary the brightness slowly over the image, as a near lamp or a lens does."""
     coarse = 1 + rng.uniform(0, 0.25) * rng.uniform(-1, 1, (3, 4)).astype(np.float32)
-    return (
-        rgb
-        * cv2.resize(coarse.astype(np.float32), rgb.shape[1::-1], interpolation=cv2.INTER_CUBIC)[
-            ..., None
-        ]
-    )
+    coarse = coarse.astype(np.float32)
+    return rgb * cv2.resize(coarse, rgb.shape[1::-1], interpolation=cv2.INTER_CUBIC)[..., None]
 
 
 def motion_kernel(rng: np.random.Generator, length: int) -> np.ndarray:
@@ -170,9 +163,8 @@ def _lose_surfaces(depth: np.ndarray, photo: np.ndarray, rng: np.random.Generato
     if rng.random() < 0.3:
         return np.zeros((height, width), bool)
     blotch = noise_field(rng, 256, (16, 32, 64, 128))
-    blotch = cv2.resize(blotch, (max(width, height),) * 2, interpolation=cv2.INTER_LINEAR)[
-        :height, :width
-    ]
+    side = max(width, height)
+    blotch = cv2.resize(blotch, (side, side), interpolation=cv2.INTER_LINEAR)[:height, :width]
     bright = photo.mean(-1)
     bad = blotch + 0.15 * ((bright < 0.1) | (bright > 0.97))
     share = rng.uniform(0, 1) ** 2 * 0.08

@@ -25,10 +25,8 @@ def make_solid(mesh: Mesh) -> Solid:
     """Compute the hull, the bounding sphere and the stable rotations of a mesh."""
     hull = mesh.vertices[np.unique((fibonacci_sphere(300) @ mesh.vertices.T).argmax(1))]
     center = mesh.bounds.mean(0)
-    rests, weights = find_stable_rotations(hull)
-    return Solid(
-        mesh, hull, center, float(np.linalg.norm(hull - center, axis=1).max()), rests, weights
-    )
+    radius = float(np.linalg.norm(hull - center, axis=1).max())
+    return Solid(mesh, hull, center, radius, *find_stable_rotations(hull))
 
 
 def find_stable_rotations(hull: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -50,9 +48,8 @@ def find_stable_rotations(hull: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     rng = np.random.default_rng(0)
     for spread in np.geomspace(0.2, 0.001, 32):
         trial = down[:, None] + spread * rng.standard_normal((1, 12, 3))
-        trial = np.concatenate(
-            [down[:, None], trial / np.linalg.norm(trial, axis=-1, keepdims=True)], 1
-        )
+        trial /= np.linalg.norm(trial, axis=-1, keepdims=True)
+        trial = np.concatenate([down[:, None], trial], 1)
         down = trial[np.arange(directions), (trial @ body.T).max(-1).argmin(1)]
     ends, counts = [down[0]], [0]
     for d in down:
@@ -64,9 +61,8 @@ def find_stable_rotations(hull: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
             counts.append(1)
     weights = np.array(counts, float)
     keep = weights > 0.01 * directions
-    return np.stack([rotation_down(d) for d in np.stack(ends)[keep]]), weights[keep] / weights[
-        keep
-    ].sum()
+    rests = np.stack([rotation_down(d) for d in np.stack(ends)[keep]])
+    return rests, weights[keep] / weights[keep].sum()
 
 
 def rotation_down(direction: np.ndarray) -> np.ndarray:

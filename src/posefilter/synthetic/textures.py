@@ -66,17 +66,15 @@ def marble(rng: np.random.Generator, size: int) -> np.ndarray:
     """Mix three colors by smooth noise."""
     a, b, c = (random_color(rng) for _ in range(3))
     out = a + (b - a) * noise_field(rng, size)[..., None]
-    return (
-        out + (c - out) * (noise_field(rng, size, (32, 64, 128)) * rng.uniform(0, 0.8))[..., None]
-    )
+    veins = noise_field(rng, size, (32, 64, 128)) * rng.uniform(0, 0.8)
+    return out + (c - out) * veins[..., None]
 
 
 def wood(rng: np.random.Generator, size: int) -> np.ndarray:
     """Draw grain: noise drawn out along one side."""
     base = np.array([0.62, 0.42, 0.25]) * rng.uniform(0.35, 1.5) + rng.normal(0, 0.04, 3)
-    strip = noise_field(rng, size, (16, 32, 64, 128))[
-        : max(2, size // int(rng.choice([8, 16, 32])))
-    ]
+    field = noise_field(rng, size, (16, 32, 64, 128))
+    strip = field[: max(2, size // int(rng.choice([8, 16, 32])))]
     grain = cv2.resize(strip, (size, size), interpolation=cv2.INTER_LINEAR)
     out = base * (1 + (grain[..., None] - 0.5) * rng.uniform(0.2, 0.9))
     return out.transpose(1, 0, 2) if rng.random() < 0.5 else out
@@ -102,9 +100,8 @@ def stripes(rng: np.random.Generator, size: int) -> np.ndarray:
 
 def label(rng: np.random.Generator, size: int, base: Color | None = None) -> np.ndarray:
     """Draw a printed face: rectangles, discs and lines of writing on one color."""
-    out = np.ones((size, size, 3)) * (
-        random_color(rng) if base is None else np.clip(base + rng.normal(0, 0.05, 3), 0, 1)
-    )
+    paper = random_color(rng) if base is None else np.clip(base + rng.normal(0, 0.05, 3), 0, 1)
+    out = np.ones((size, size, 3)) * paper
     for _ in range(int(rng.integers(3, 14))):
         a, b = np.sort(rng.integers(0, size, (2, 2)), axis=0)
         if rng.random() < 0.25:
@@ -169,9 +166,8 @@ def crop_texture(rng: np.random.Generator, photo: np.ndarray, size: int) -> np.n
     """
     side = int(rng.integers(min(photo.shape[:2]) // 8 + 1, min(photo.shape[:2]) // 2 + 2))
     row, column = (int(rng.integers(0, n - side + 1)) for n in photo.shape[:2])
-    out = cv2.resize(
-        photo[row : row + side, column : column + side], (size, size), interpolation=cv2.INTER_AREA
-    )
+    cut = photo[row : row + side, column : column + side]
+    out = cv2.resize(cut, (size, size), interpolation=cv2.INTER_AREA)
     if rng.random() < 0.5:
         out = out[..., rng.permutation(3)]
     return out / 255.0
