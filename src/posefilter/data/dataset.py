@@ -126,11 +126,8 @@ class EpochShuffle(Sampler[int]):
 
     def __iter__(self) -> Iterator[int]:
         """Yield the epoch's order."""
-        order = (
-            np.random.default_rng([self._seed, self._epoch, 1 << 20])
-            .permutation(self._length)
-            .tolist()
-        )
+        rng = np.random.default_rng([self._seed, self._epoch, 1 << 20])
+        order = rng.permutation(self._length).tolist()
         skip, self._skip = self._skip, 0
         own = order[self._rank :: self._processes][: len(self)]
         return iter(own[skip:])

@@ -46,21 +46,22 @@ def resize(sample: Sample, height: int, width: int) -> Sample:
     before = sample.mask.shape
     if before == (height, width):
         return sample
-    shrinks = height <= before[0] and width <= before[1]
     K = torch.from_numpy(sample.intrinsics.astype(np.float64))
+    K = resize_intrinsics(K, width / before[1], height / before[0])
     return dataclasses.replace(
         sample,
-        rgb=cv2.resize(
-            sample.rgb,
-            (width, height),
-            interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR,
-        ),
+        rgb=_average(sample.rgb, height, width),
         depth=resize_depth(sample.depth, height, width),
         mask=resize_mask(sample.mask, height, width),
-        intrinsics=resize_intrinsics(K, width / before[1], height / before[0])
-        .numpy()
-        .astype(np.float32),
+        intrinsics=K.numpy().astype(np.float32),
     )
+
+
+def _average(image: np.ndarray, height: int, width: int) -> np.ndarray:
+    """Return an image at another size: averaged where it shrinks, else interpolated."""
+    shrinks = height <= image.shape[0] and width <= image.shape[1]
+    how = cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR
+    return cv2.resize(image, (width, height), interpolation=how)
 
 
 def resize_mask(mask: np.ndarray, height: int, width: int) -> np.ndarray:
@@ -69,9 +70,7 @@ def resize_mask(mask: np.ndarray, height: int, width: int) -> np.ndarray:
     Ties are decided as on a chess board: the nearest old pixel would shift masks by a sixth of a
     pixel at half the size.
     """
-    shrinks = height <= mask.shape[0] and width <= mask.shape[1]
-    interpolation = cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR
-    share = cv2.resize(mask.astype(np.float32), (width, height), interpolation=interpolation)
+    share = _average(mask.astype(np.float32), height, width)
     even = (np.arange(height)[:, None] + np.arange(width)) % 2 == 0
     return (share > 0.5 + 1e-4) | ((share > 0.5 - 1e-4) & even)
 

@@ -28,9 +28,8 @@ class Geometry:
 
     def mesh(self, name: str) -> Mesh | None:
         """Return a class's mesh, None where there is none that fits."""
-        return (
-            self.meshes.load(name) if self.meshes.has(name) and name not in self.without else None
-        )
+        fits = self.meshes.has(name) and name not in self.without
+        return self.meshes.load(name) if fits else None
 
     def render(
         self,

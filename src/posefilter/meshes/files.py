@@ -1,6 +1,5 @@
 """Read OBJ, PLY and GLB files into `Mesh`."""
 
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -29,17 +28,12 @@ def read_mesh(path: Path, name: str, scale: float = 1.0) -> Mesh:
     Raises:
         UserError: It is missing, corrupt or empty, or its texture is missing; names the file.
     """
-    readers: dict[str, Callable[[Path], RawMesh]] = {
-        ".obj": read_obj,
-        ".ply": _read_other,
-        ".glb": _read_other,
-    }
-    if path.suffix.lower() not in readers:
+    if path.suffix.lower() not in SUFFIXES:
         raise UserError(f"{path}: cannot read meshes of this kind; known are {', '.join(SUFFIXES)}")
     if not path.is_file():
         raise UserError(f"{path}: no such mesh file")
     try:
-        raw = readers[path.suffix.lower()](path)
+        raw = read_obj(path) if path.suffix.lower() == ".obj" else _read_other(path)
     except UserError:
         raise
     # depending on the damage, parsers raise anything from KeyError to struct.error
@@ -115,10 +109,11 @@ def _read_other(path: Path) -> RawMesh:
         own = [getattr(raw, name) for raw in raws]
         if all(x is None for x in own):
             return None
-        pairs = zip(own, counts, strict=True)
-        return np.concatenate(
-            [np.full((n, 3, width), missing) if x is None else x for x, n in pairs]
-        )
+        filled = [
+            np.full((n, 3, width), missing) if x is None else x
+            for x, n in zip(own, counts, strict=True)
+        ]
+        return np.concatenate(filled)
 
     counts = [len(raw.faces) for raw in raws]
     starts = np.cumsum([0] + [len(raw.vertices) for raw in raws])[:-1]
@@ -182,15 +177,8 @@ def _from_trimesh(mesh: trimesh.Trimesh, path: Path) -> RawMesh:
     # set by trimesh's readers only where the file has normals
     given = mesh._cache.cache.get("vertex_normals")
     normals = None if given is None else np.asarray(given)[faces]
-    return RawMesh(
-        np.asarray(mesh.vertices),
-        faces,
-        uv,
-        normals,
-        colors,
-        np.zeros(len(faces), dtype=np.int64),
-        [material],
-    )
+    alike = np.zeros(len(faces), dtype=np.int64)
+    return RawMesh(np.asarray(mesh.vertices), faces, uv, normals, colors, alike, [material])
 
 
 def _unit(colors: np.ndarray) -> np.ndarray:

@@ -20,6 +20,7 @@ from posefilter.geometry.rotation import log_so3
 from posefilter.meshes.mesh import (
     Mesh,
     diameter,
+    face_normals,
     hull_vertices,
     sample_surface,
     surface_colors,
@@ -79,8 +80,7 @@ def _sample(mesh: Mesh) -> _Surface:
     many_faces, many_weights = sample_surface(mesh, _DENSE, seed=1)
     points = surface_points(mesh, face, weights)
     dense = surface_points(mesh, many_faces, many_weights)
-    a, b, c = (mesh.vertices[mesh.faces[:, i]] for i in range(3))
-    cross = np.cross(b - a, c - a)
+    cross = face_normals(mesh.vertices, mesh.faces)
     unit = cross / np.maximum(np.linalg.norm(cross, axis=1, keepdims=True), 1e-20)
     normals = 0.05 * size * unit
     sides = cKDTree(np.concatenate([dense, normals[many_faces]], axis=1))
@@ -116,9 +116,8 @@ def _try(
     color = max(float(np.quantile(_color_change(surface, turn), 0.95)) for turn in exact)
     limit = surface.diameter
     shape = distance <= MEAN_EXCESS * limit and far <= FAR_EXCESS * limit
-    return RotationalSymmetry(
-        axis, point, fold, distance, far, color, shape, shape and color <= MOST_COLOR
-    )
+    texture = shape and color <= MOST_COLOR
+    return RotationalSymmetry(axis, point, fold, distance, far, color, shape, texture)
 
 
 def _excess(after: np.ndarray, before: np.ndarray, of: Callable[[np.ndarray], Any]) -> float:

@@ -55,17 +55,26 @@ class Mesh:
         return np.stack([self.vertices.min(0), self.vertices.max(0)])
 
 
+def face_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """Return normals as long as twice the area of each triangle.  (V, 3) [m], (F, 3) -> (F, 3)."""
+    a, b, c = (vertices[faces[:, i]] for i in range(3))
+    return np.cross(b - a, c - a)
+
+
 def face_areas(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     """Return the area of each triangle.  (V, 3) [m], (F, 3) -> (F,) [m^2]."""
-    a, b, c = (vertices[faces[:, i]] for i in range(3))
-    return 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)
+    return 0.5 * np.linalg.norm(face_normals(vertices, faces), axis=1)
+
+
+def _weld(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """Return the faces (F, 3) with one number for all vertices of one position."""
+    _, numbers = np.unique(np.round(vertices, 7), axis=0, return_inverse=True)
+    return numbers.reshape(-1)[faces]
 
 
 def find_open_edges(vertices: np.ndarray, faces: np.ndarray) -> float:
     """Return the share of edges that do not belong to two triangles.  (V, 3) [m], (F, 3)."""
-    _, weld = np.unique(np.round(vertices, 7), axis=0, return_inverse=True)
-    welded = weld.reshape(-1)[faces]
-    edges = np.sort(welded[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
+    edges = np.sort(_weld(vertices, faces)[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
     return float((np.unique(edges, axis=0, return_counts=True)[1] != 2).mean())
 
 
@@ -101,12 +110,10 @@ def creased_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     Raises:
         ValueError: So many faces meet in one place that they are no surface.
     """
-    a, b, c = (vertices[faces[:, i]] for i in range(3))
-    weighted = np.cross(b - a, c - a)  # length: twice the area
+    weighted = face_normals(vertices, faces)
     length = np.linalg.norm(weighted, axis=1, keepdims=True)
     unit = weighted / np.maximum(length, 1e-20)
-    _, weld = np.unique(np.round(vertices, 7), axis=0, return_inverse=True)
-    corner_vertex = weld.reshape(-1)[faces].reshape(-1)
+    corner_vertex = _weld(vertices, faces).reshape(-1)
     order = np.argsort(corner_vertex, kind="stable")
     starts = np.searchsorted(corner_vertex[order], np.arange(corner_vertex.max() + 2))
     total = np.zeros((len(corner_vertex), 3))
@@ -124,11 +131,8 @@ def creased_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
                 total[some[:, own]] = np.einsum("vij,vjc->vic", near, weighted[face])
     norm = np.linalg.norm(total, axis=1, keepdims=True)
     fallback = np.where(length > 0, unit, [0.0, 0.0, 1.0]).repeat(3, axis=0)
-    return (
-        np.where(norm > 0, total / np.maximum(norm, 1e-20), fallback)
-        .reshape(-1, 3, 3)
-        .astype(np.float32)
-    )
+    normals = np.where(norm > 0, total / np.maximum(norm, 1e-20), fallback)
+    return normals.reshape(-1, 3, 3).astype(np.float32)
 
 
 def sample_surface(mesh: Mesh, count: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
@@ -173,9 +177,8 @@ def surface_colors(mesh: Mesh, face: np.ndarray, weights: np.ndarray) -> np.ndar
     """
     height, width = mesh.texture.shape[:2]
     if mesh.corner_uv is None:
-        color = np.broadcast_to(mesh.texture[0, 0] / np.float32(255), (len(face), 3)).astype(
-            np.float32
-        )
+        plain = (mesh.texture[0, 0] / np.float32(255)).astype(np.float32)
+        color = np.tile(plain, (len(face), 1))
     else:
         uv = np.einsum("pi,pic->pc", weights, mesh.corner_uv[face])
         x, y = uv[:, 0] * width - 0.5, (1 - uv[:, 1]) * height - 0.5
@@ -186,11 +189,10 @@ def surface_colors(mesh: Mesh, face: np.ndarray, weights: np.ndarray) -> np.ndar
         ]
         rows = [pixel[j][0] * (1 - fx) + pixel[j][1] * fx for j in (0, 1)]
         color = ((rows[0] * (1 - fy) + rows[1] * fy) / 255).astype(np.float32)
-    if mesh.corner_colors is not None:
-        color = color * np.einsum("pi,pic->pc", weights, mesh.corner_colors[face]).astype(
-            np.float32
-        )
-    return color
+    if mesh.corner_colors is None:
+        return color
+    tint = np.einsum("pi,pic->pc", weights, mesh.corner_colors[face])
+    return color * tint.astype(np.float32)
 
 
 def hull_vertices(vertices: np.ndarray) -> np.ndarray:
@@ -233,9 +235,8 @@ def outline_hull(vertices: np.ndarray, max_vertices: int = _HULL_VERTICES) -> np
         full = full[_find_outermost(full, directions)]
     reach = full.astype(np.float32) @ directions.T.astype(np.float32)  # (H, D)
     target, best = reach.max(axis=0), reach.argmax(axis=0)
-    chosen = list(
-        dict.fromkeys(np.concatenate([full.argmax(axis=0), full.argmin(axis=0)]).tolist())
-    )
+    extremes = [*full.argmax(axis=0).tolist(), *full.argmin(axis=0).tolist()]
+    chosen = list(dict.fromkeys(extremes))
     have = reach[chosen].max(axis=0)
     while len(chosen) < max_vertices:
         worst = int(np.argmax(target - have))

@@ -124,9 +124,8 @@ def read_obj(path: Path) -> RawMesh:
             current = materials.setdefault(rest, len(materials))
     index = np.array(corners, dtype=np.int64).reshape(-1, 3, 3)  # face, corner, (v, vt, vn)
     vertices = _rectangle(numbers["v"], 3)
-    colors = (
-        _rectangle(numbers["v"], 6)[:, 3:] if numbers["v"] and len(numbers["v"][0]) >= 6 else None
-    )
+    colored = len(numbers["v"]) > 0 and len(numbers["v"][0]) >= 6
+    colors = _rectangle(numbers["v"], 6)[:, 3:] if colored else None
     if colors is not None and colors.max(initial=0.0) > _BRIGHTEST:  # numbers of 8 bits
         colors = colors / 255
     unknown = [name for name in materials if name not in library]
@@ -137,9 +136,7 @@ def read_obj(path: Path) -> RawMesh:
         )
     # colors of vertices are whole by themselves
     plain = PLAIN if colors is None else PLAIN._replace(color=np.ones(3))
-    known = (
-        [library.get(name, plain) for name in materials] or list(library.values())[:1] or [plain]
-    )
+    known = [library.get(name, plain) for name in materials] or [*library.values(), plain][:1]
     faces = index[..., 0]
     if len(faces) and (faces.min() < 0 or faces.max() >= len(vertices)):
         raise UserError(f"{path}: a face names a vertex that is not there (is the file cut short?)")

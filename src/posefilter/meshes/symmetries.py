@@ -1,5 +1,6 @@
 """Symmetries of objects: declared transforms that change nothing one can see."""
 
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -51,6 +52,7 @@ def rotation_about(axis: np.ndarray, angle: float, point: np.ndarray) -> np.ndar
     return rigid(turn, point - turn @ point)
 
 
+_floats = partial(np.array, dtype=np.float64)
 _ALONE = {"symmetries_discrete", "symmetries_continuous"}  # keys of a file for one object
 
 
@@ -82,17 +84,11 @@ def read_symmetries(info: Path, name: str, scale: float, steps: int) -> np.ndarr
             raise ValueError("no mapping of names")
         alone = table if _ALONE & set(table) else {}
         entry = next((table[k] for k in _list_keys(name) if k in table), alone)
-        discrete = [
-            np.array(m, dtype=np.float64).reshape(4, 4)
-            for m in entry.get("symmetries_discrete", [])
-        ]
+        discrete = [_floats(m).reshape(4, 4) for m in entry.get("symmetries_discrete", [])]
         for matrix in discrete:
             matrix[:3, 3] *= scale
         continuous = [
-            (
-                np.array(c["axis"], dtype=np.float64),
-                np.array(c.get("offset", [0, 0, 0]), dtype=np.float64) * scale,
-            )
+            (_floats(c["axis"]), _floats(c.get("offset", [0, 0, 0])) * scale)
             for c in entry.get("symmetries_continuous", [])
         ]
         return identity_first(symmetry_group(discrete, continuous, steps), str(info))

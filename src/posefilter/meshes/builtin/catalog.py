@@ -56,37 +56,25 @@ def make_printed_box(
     texture = np.zeros((TEXTURE, TEXTURE, 3), dtype=np.uint8)
     slots: dict[str, Rect] = {}
     for face, (x0, y0, x1, y1) in cells.items():
-        texture[y0:y1, x0:x1] = cv2.resize(
-            prints[face], (x1 - x0, y1 - y0), interpolation=cv2.INTER_AREA
-        )
+        size_px = x1 - x0, y1 - y0
+        texture[y0:y1, x0:x1] = cv2.resize(prints[face], size_px, interpolation=cv2.INTER_AREA)
         # Half a texel in from the cell's edge, so that bilinear reading never mixes neighbors in.
-        slots[face] = (
-            (x0 + 0.5) / TEXTURE,
-            1 - (y1 - 0.5) / TEXTURE,
-            (x1 - 0.5) / TEXTURE,
-            1 - (y0 + 0.5) / TEXTURE,
-        )
+        left, right = (x0 + 0.5) / TEXTURE, (x1 - 0.5) / TEXTURE
+        slots[face] = (left, 1 - (y1 - 0.5) / TEXTURE, right, 1 - (y0 + 0.5) / TEXTURE)
     return weld(name, box(size, slots), texture)
 
 
 def _brick() -> Mesh:
     """Make the foam brick, which is symmetric under half turns about its three axes."""
     mesh = make_printed_box("brick", builtin_boxes.BRICK_SIZE, builtin_boxes.brick_faces())
-    center = mesh.bounds.mean(0)
-    return replace(
-        mesh,
-        symmetries=np.stack(
-            [np.eye(4), *(rotation_about(axis, np.pi, center) for axis in np.eye(3))]
-        ),
-    )
+    half_turns = [rotation_about(axis, np.pi, mesh.bounds.mean(0)) for axis in np.eye(3)]
+    return replace(mesh, symmetries=np.stack([np.eye(4), *half_turns]))
 
 
 def _bowl() -> Mesh:
     """Make the bowl, which is symmetric under every rotation about z."""
-    return replace(
-        builtin_vessels.bowl(),
-        symmetries=symmetry_group(continuous=[(np.array([0, 0, 1.0]), np.zeros(3))]),
-    )
+    z_axis = np.array([0, 0, 1.0]), np.zeros(3)
+    return replace(builtin_vessels.bowl(), symmetries=symmetry_group(continuous=[z_axis]))
 
 
 _BUILDERS: dict[str, Callable[[], Mesh]] = {

@@ -29,9 +29,7 @@ def weld(name: str, soup: Soup, texture: np.ndarray) -> Mesh:
     rounded = np.round(soup.corners.reshape(-1, 3), 8)
     vertices, inverse = np.unique(rounded, axis=0, return_inverse=True)
     faces = inverse.reshape(-1, 3).astype(np.int64)
-    solid = (
-        (faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 2] != faces[:, 0])
-    )
+    solid = (faces != np.roll(faces, 1, axis=1)).all(axis=1)
     faces, uv = faces[solid], soup.uv[solid].astype(np.float32)
     return Mesh(name, vertices, faces, uv, texture, None, creased_normals(vertices, faces))
 
@@ -90,14 +88,8 @@ def lathe(
     """
     rows = np.array([(p[0], p[0], p[1]) if len(p) == 2 else p for p in profile])
     ring = _ring(segments, power)
-    points = np.stack(
-        [
-            rows[:, None, 0] * ring[None, :, 0],
-            rows[:, None, 1] * ring[None, :, 1],
-            np.tile(rows[:, 2:], (1, segments + 1)),
-        ],
-        axis=-1,
-    )
+    heights = np.tile(rows[:, 2:], (1, segments + 1))
+    points = np.concatenate([rows[:, None, :2] * ring, heights[..., None]], axis=-1)
     along = _arc(np.stack([rows[:, :2].mean(1), rows[:, 2]], 1))
     u0, v0, u1, v1 = rect
     u, v = np.meshgrid(np.linspace(u0, u1, segments + 1), v0 + along * (v1 - v0))
