@@ -9,7 +9,7 @@ import trimesh
 from scipy.spatial import cKDTree
 from ycb_sizes import YCB_SIZES
 
-from posefilter.meshes.builtin import carton as builtin_carton
+from posefilter.meshes.builtin import boxes as builtin_boxes
 from posefilter.meshes.builtin import catalog as builtin
 from posefilter.meshes.builtin.shapes import box, disc, lathe, tube, weld
 from posefilter.meshes.mesh import Mesh, surface_colors
@@ -152,7 +152,9 @@ def _picture(mesh: Mesh, face: str, height: int = 24, width: int = 24) -> np.nda
 @pytest.mark.parametrize("face", sorted(NORMALS))
 def test_the_carton_shows_its_print_upright_and_unmirrored(face: str) -> None:
     seen = _picture(builtin.build("carton"), face)
-    printed = cv2.resize(builtin_carton.faces()[face], (24, 24), interpolation=cv2.INTER_AREA) / 255
+    printed = (
+        cv2.resize(builtin_boxes.carton_faces()[face], (24, 24), interpolation=cv2.INTER_AREA) / 255
+    )
     error = {
         "as it is": np.abs(seen - printed).mean(),
         "mirrored": np.abs(seen[:, ::-1] - printed).mean(),

@@ -7,7 +7,6 @@ import cv2
 import numpy as np
 
 from posefilter.meshes.builtin import boxes as builtin_boxes
-from posefilter.meshes.builtin import carton as builtin_carton
 from posefilter.meshes.builtin import round as builtin_round
 from posefilter.meshes.builtin import vessels as builtin_vessels
 from posefilter.meshes.builtin.shapes import Rect, box, weld
@@ -82,7 +81,9 @@ _BUILDERS: dict[str, Callable[[], Mesh]] = {
     "bleach_bottle": builtin_round.bleach_bottle,
     "bowl": _bowl,
     "brick": _brick,
-    "carton": lambda: make_printed_box("carton", builtin_carton.SIZE, builtin_carton.faces()),
+    "carton": lambda: make_printed_box(
+        "carton", builtin_boxes.CARTON_SIZE, builtin_boxes.carton_faces()
+    ),
     "coffee_can": builtin_round.coffee_can,
     "gelatin_carton": lambda: make_printed_box(
         "gelatin_carton", builtin_boxes.GELATIN_SIZE, builtin_boxes.gelatin_faces()
