@@ -124,11 +124,7 @@ class PoseDataModule(LightningDataModule):
         self._image_width, self._image_height = image_width, image_height
         self._split = dict(split or {"train": 0.8, "val": 0.1, "test": 0.1})
         self._split_seed = split_seed
-        self._least = {
-            "train": min_visibility,
-            "val": min_visibility_test,
-            "test": min_visibility_test,
-        }
+        self._least = dict.fromkeys(NAMES, min_visibility_test) | {"train": min_visibility}
         self._limits = {"train": limit_train, "val": limit_val, "test": limit_test}
         self._batch_size, self._batch_size_test = batch_size, batch_size_test or batch_size
         self._workers = spare_cores() if workers is None else workers
@@ -332,14 +328,15 @@ class PoseDataModule(LightningDataModule):
 
     def describe(self) -> dict[str, Any]:
         """Return objects, frames and scenes of each split, and the frames left out by reason."""
-        splits = {}
-        for name, dataset in self._datasets.items():
-            splits[name] = {
+        splits = {
+            name: {
                 "frames": len(dataset),
                 "images": len({record.files[0] for record in dataset.records}),
                 "scenes": len({record.group for record in dataset.records}),
                 "left_out": dict(self._left_out[name]),
             }
+            for name, dataset in self._datasets.items()
+        }
         return {
             "source": self.source,
             "root": str(self.root),

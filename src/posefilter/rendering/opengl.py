@@ -102,23 +102,19 @@ class GLRenderer(Renderer):
         for i, one in enumerate(instances):
             self._begin(target)
             self._draw(one, i)
-            unoccluded[i] = int((self._read(target, 0, height, width)[..., 3] >= 0).sum())
+            unoccluded[i] = int((self._read(target, 0)[..., 3] >= 0).sum())
         self._begin(target)
         for i, one in enumerate(instances):
             self._draw(one, i)
         for plane in planes:
             self._draw_plane(plane)
-        surface, shape = self._read(target, 0, height, width), self._read(target, 1, height, width)
+        surface, shape = self._read(target, 0), self._read(target, 1)
         index = np.round(surface[..., 3]).astype(np.int32)
         albedo = np.ascontiguousarray(surface[..., :3])
         albedo[shape[..., 3] == 0] = 0
-        return Surfaces(
-            albedo,
-            np.ascontiguousarray(shape[..., :3]),
-            np.ascontiguousarray(shape[..., 3]),
-            np.where(index < 0, -1, index).astype(np.int32),
-            unoccluded,
-        )
+        normal = np.ascontiguousarray(shape[..., :3])
+        depth = np.ascontiguousarray(shape[..., 3])
+        return Surfaces(albedo, normal, depth, np.maximum(index, -1), unoccluded)
 
     def _target(self, height: int, width: int) -> Any:
         """Return the frame buffer of an image size."""
@@ -137,39 +133,20 @@ class GLRenderer(Renderer):
             np.tile(np.array([0, 0, 0, -1], np.float32), target.width * target.height).tobytes()
         )
 
-    def _read(self, target: Any, attachment: int, height: int, width: int) -> np.ndarray:
+    def _read(self, target: Any, attachment: int) -> np.ndarray:
         data = target.read(components=4, attachment=attachment, dtype="f4", alignment=1)
-        return np.frombuffer(data, np.float32).reshape(height, width, 4)
+        return np.frombuffer(data, np.float32).reshape(target.height, target.width, 4)
 
     def _draw(self, one: Instance, index: int) -> None:
-        linear = one.camera_from_object[:3, :3]
-        self._submit(
-            one.mesh,
-            _mesh_vertices,
-            one.camera_from_object,
-            np.linalg.inv(linear).T,
-            one.mesh.texture,
-            index,
-        )
+        pose = one.camera_from_object
+        self._submit(one.mesh, _mesh_vertices, pose, np.linalg.inv(pose[:3, :3]).T, index)
 
     def _draw_plane(self, plane: Plane) -> None:
-        self._submit(
-            plane,
-            _plane_vertices,
-            plane.camera_from_plane,
-            plane.camera_from_plane[:3, :3],
-            plane.texture,
-            -1,
-        )
+        pose = plane.camera_from_plane
+        self._submit(plane, _plane_vertices, pose, pose[:3, :3], -1)
 
     def _submit(
-        self,
-        shape: Any,
-        vertices: Any,
-        pose: np.ndarray,
-        normal_matrix: np.ndarray,
-        texture: np.ndarray,
-        index: int,
+        self, shape: Any, vertices: Any, pose: np.ndarray, normal_matrix: np.ndarray, index: int
     ) -> None:
         """Draw one shape; upload what is not on the device yet."""
         key = id(shape)
@@ -183,7 +160,7 @@ class GLRenderer(Renderer):
         self._program["camera_from_object"].write(pose.T.astype("f4").tobytes())
         self._program["normal_matrix"].write(normal_matrix.T.astype("f4").tobytes())
         self._program["index"].value = float(index)
-        self._texture(texture).use(0)
+        self._texture(shape.texture).use(0)
         self._arrays[key].array.render()
 
     def _texture(self, texture: np.ndarray) -> Any:

@@ -1,6 +1,7 @@
 """Render the frames of a generated dataset; each depends on settings, seed and its number alone."""
 
 import json
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
@@ -153,14 +154,9 @@ class FrameRenderer:
             layout = self.scenario(number).at(k)
             layout = remove_target(layout) if absent else layout
             return layout, self._render(layout), rng
-        for _ in range(ATTEMPTS):
-            drawn = self._draw_layout(scene, rng)
-            if drawn is None:
-                continue
-            layout = remove_target(drawn) if absent else drawn
-            picture = self._render(layout)
-            if all(self._shows(picture, k) for k in range(layout.targets)):
-                return layout, picture, rng
+        first = next(self._draw_layouts(scene, rng, absent), None)
+        if first is not None:
+            return *first, rng
         raise UserError(
             f"frame {frame}: no layout of {self.job.object} fits after {ATTEMPTS} tries; "
             "the object may be too large or small for this camera, or occlusion and distractors "
@@ -176,13 +172,7 @@ class FrameRenderer:
         scene, _ = self.scene(number)
         rng = np.random.default_rng([self.job.seed, 4, number])
         view = View(self.K, self.job.height, self.job.width)
-        for _ in range(ATTEMPTS):
-            layout = self._draw_layout(scene, rng)
-            if layout is None:
-                continue
-            picture = self._render(layout)
-            if not all(self._shows(picture, k) for k in range(layout.targets)):
-                continue
+        for layout, _ in self._draw_layouts(scene, rng):
             for _ in range(8):
                 found = draw_scenario(
                     layout, self.job.motion, self.job.frames_per_scene, scene.textures[1], rng
@@ -194,9 +184,19 @@ class FrameRenderer:
             f"tries; choose fewer frames_per_scene, or less of moving_mm and moving_deg"
         )
 
-    def _draw_layout(self, scene: SceneSet, rng: np.random.Generator) -> Layout | None:
+    def _draw_layouts(
+        self, scene: SceneSet, rng: np.random.Generator, absent: bool = False
+    ) -> Iterator[tuple[Layout, Rendered]]:
+        """Yield layouts that show enough of the target, unless it is to be absent, and images."""
         size = self.job.height, self.job.width
-        return draw_layout(scene, self.job.scenes, self.K, *size, rng)
+        for _ in range(ATTEMPTS):
+            drawn = draw_layout(scene, self.job.scenes, self.K, *size, rng)
+            if drawn is None:
+                continue
+            layout = remove_target(drawn) if absent else drawn
+            picture = self._render(layout)
+            if all(self._shows(picture, k) for k in range(layout.targets)):
+                yield layout, picture
 
     def _render(self, layout: Layout) -> Rendered:
         size = self.job.height, self.job.width

@@ -3,7 +3,6 @@
 The result does not depend on the number of processes, and an interrupted run can be resumed.
 """
 
-import importlib.metadata
 import inspect
 import json
 import logging
@@ -12,6 +11,7 @@ import time
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from hashlib import sha256
+from importlib import metadata
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -407,10 +407,8 @@ def _read_record(out: Path) -> _Record | None:
 
 def _find_version(package: str) -> str | None:
     try:
-        return importlib.metadata.version(package)
-    except (
-        importlib.metadata.PackageNotFoundError
-    ):  # OpenCV has several names; Embree may be missing
+        return metadata.version(package)
+    except metadata.PackageNotFoundError:  # OpenCV has several names; Embree may be missing
         return None
 
 

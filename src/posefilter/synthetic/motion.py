@@ -15,7 +15,7 @@ from posefilter.errors import UserError
 from posefilter.geometry.rigid import rigid
 from posefilter.rendering.surfaces import Plane
 from posefilter.synthetic.placing import Placed, View, are_separate
-from posefilter.synthetic.scenes import Layout
+from posefilter.synthetic.scenes import Layout, move_all
 
 MOTIONS = ("none", "camera", "object", "both")
 _PERIODS = (16.0, 48.0)  # [frames] of the sine along each axis
@@ -61,26 +61,12 @@ class Scenario:
 
     def at(self, frame: int) -> Layout:
         """Return the layout of a frame."""
-        first = self.layout.placed[0]
+        first, *others = self.layout.placed
         moved = _move_about(self.target[frame], first.center) @ first.camera_from_object
-        target = Placed(first.solid, moved)
-        whole = _move_about(self.camera[frame], first.center)
-        placed = tuple(
-            Placed(one.solid, whole @ one.camera_from_object)
-            for one in (target, *self.layout.placed[1:])
-        )
-        planes = tuple(
-            replace(plane, camera_from_plane=whole @ plane.camera_from_plane)
-            for plane in self.layout.planes
-        )
-        turn = whole[:3, :3]
-        ways = [turn @ np.array(way) for way in self.layout.lights.directions]
-        lights = replace(
-            self.layout.lights, directions=tuple((float(x), float(y), float(z)) for x, y, z in ways)
-        )
-        cover = self._place_cover(frame, placed[0])
-        planes = planes if cover is None else (*planes, cover)
-        return replace(self.layout, placed=placed, planes=planes, lights=lights)
+        layout = replace(self.layout, placed=(Placed(first.solid, moved), *others))
+        layout = move_all(layout, _move_about(self.camera[frame], first.center))
+        cover = self._place_cover(frame, layout.placed[0])
+        return layout if cover is None else replace(layout, planes=(*layout.planes, cover))
 
     def _place_cover(self, frame: int, target: Placed) -> Plane | None:
         """Return the cover, which faces the camera; None while it is out of the way."""

@@ -278,7 +278,16 @@ def remove_target(layout: Layout) -> Layout:
 
 def shift_camera(layout: Layout, offset: float) -> Layout:
     """Return the layout in the frame of a camera that stands `offset` [m] to the right."""
-    move = rigid(np.eye(3), [-offset, 0, 0])
-    placed = tuple(Placed(p.solid, move @ p.camera_from_object) for p in layout.placed)
-    planes = tuple(replace(p, camera_from_plane=move @ p.camera_from_plane) for p in layout.planes)
-    return replace(layout, placed=placed, planes=planes)
+    return move_all(layout, rigid(np.eye(3), [-offset, 0, 0]))
+
+
+def move_all(layout: Layout, motion: np.ndarray) -> Layout:
+    """Return the layout with all in it moved (4, 4) [m] before the camera, lights too."""
+    placed = tuple(Placed(p.solid, motion @ p.camera_from_object) for p in layout.placed)
+    planes = tuple(
+        replace(p, camera_from_plane=motion @ p.camera_from_plane) for p in layout.planes
+    )
+    ways = [motion[:3, :3] @ np.array(way) for way in layout.lights.directions]
+    directions = tuple((float(x), float(y), float(z)) for x, y, z in ways)
+    lights = replace(layout.lights, directions=directions)
+    return replace(layout, placed=placed, planes=planes, lights=lights)
