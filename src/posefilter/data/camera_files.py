@@ -82,12 +82,8 @@ def _of_camera(content: Mapping[str, Any], K: np.ndarray, path: Path) -> CameraF
     coefficients = () if distortion is None else _flat(distortion["data"], path)
     projection = _listed(content, _PROJECTIONS)
     P = None if projection is None else numbers(projection, "data", path, (3, 4))
-    return CameraFile(
-        K,
-        size,
-        coefficients if any(coefficients) else (),
-        None if P is None or P[0, 0] <= 0 else P[:, :3],
-    )
+    rectified = None if P is None or P[0, 0] <= 0 else P[:, :3]
+    return CameraFile(K, size, coefficients if any(coefficients) else (), rectified)
 
 
 def _find_matrix(content: Mapping[str, Any], path: Path) -> np.ndarray | None:

@@ -41,9 +41,8 @@ def inspect_mesh(mesh: Mesh) -> MeshFacts:
     resolution = 0.0
     if mesh.corner_uv is not None and max(mesh.texture.shape[:2]) > 1:
         size = np.array(mesh.texture.shape[1::-1])
-        u, v = (
-            (mesh.corner_uv[:, i] - mesh.corner_uv[:, 0]).astype(np.float64) * size for i in (1, 2)
-        )
+        sides = (mesh.corner_uv[:, 1:] - mesh.corner_uv[:, :1]).astype(np.float64) * size
+        u, v = sides[:, 0], sides[:, 1]
         pixels = 0.5 * np.abs(u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0]).sum()
         area = face_areas(mesh.vertices, mesh.faces).sum()
         resolution = math.sqrt(pixels / max(area, 1e-12)) / 1000

@@ -29,19 +29,9 @@ BASELINE = 0.06  # [m] from the left camera to the right
 CLASS_SUFFIX = "_16k"
 OBJECT_SETTINGS = "_object_settings.json"
 CAMERA_SETTINGS = "_camera_settings.json"
-CUBOID_SIGNS = np.array(
-    [
-        [1, -1, 1],
-        [-1, -1, 1],
-        [-1, 1, 1],
-        [1, 1, 1],
-        [1, -1, -1],
-        [-1, -1, -1],
-        [-1, 1, -1],
-        [1, 1, -1],
-    ],
-    dtype=np.float64,
-)  # the order of a cuboid's corners, in the aligned frame
+# the order of a cuboid's corners, in the aligned frame
+_ROUND = ((1, -1), (-1, -1), (-1, 1), (1, 1))
+CUBOID_SIGNS = np.array([[x, y, z] for z in (1.0, -1.0) for x, y in _ROUND])
 # z up -> y down, as FAT's cracker box has it
 _ALIGNED_FROM_UPRIGHT = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
 

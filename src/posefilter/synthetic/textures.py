@@ -85,9 +85,8 @@ def carpet(rng: np.random.Generator, size: int) -> np.ndarray:
     speckle = rng.standard_normal((size, size), dtype=np.float32)
     if rng.random() < 0.5:
         speckle = blurred_noise(rng, size, size, rng.uniform(0.5, 2))
-    return (
-        random_color(rng) * rng.uniform(0.4, 1) * (1 + rng.uniform(0.1, 0.5) * speckle[..., None])
-    )
+    color = random_color(rng) * rng.uniform(0.4, 1)
+    return color * (1 + rng.uniform(0.1, 0.5) * speckle[..., None])
 
 
 def stripes(rng: np.random.Generator, size: int) -> np.ndarray:

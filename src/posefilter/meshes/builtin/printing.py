@@ -51,27 +51,14 @@ class Canvas:
     ) -> "Canvas":
         """Fill an ellipse, or draw its outline."""
         width = max(1, round(line_mm * self.px)) if line_mm else -1
-        cv2.ellipse(
-            self.image,
-            self._at(x, y),
-            self._at(rx, ry),
-            turn_deg,
-            0,
-            360,
-            color,
-            width,
-            cv2.LINE_AA,
-        )
+        center, axes = self._at(x, y), self._at(rx, ry)
+        cv2.ellipse(self.image, center, axes, turn_deg, 0, 360, color, width, cv2.LINE_AA)
         return self
 
     def polygon(self, points_mm: list[tuple[float, float]], color: Color) -> "Canvas":
         """Fill a polygon."""
-        cv2.fillPoly(
-            self.image,
-            [np.round(np.array(points_mm) * self.px).astype(np.int32)],
-            color,
-            cv2.LINE_AA,
-        )
+        points = np.round(np.array(points_mm) * self.px).astype(np.int32)
+        cv2.fillPoly(self.image, [points], color, cv2.LINE_AA)
         return self
 
     def fade(self, box: Box, top: Color, bottom: Color) -> "Canvas":
@@ -147,14 +134,9 @@ class Canvas:
         for i in range(rows):
             y = y0 + (0.19 + 0.79 * i / rows) * height
             step = 0.79 * height / rows
-            self.rect(
-                (x0 + 2, y + 0.25 * step, x0 + 2 + width * rng.uniform(0.25, 0.5), y + 0.65 * step),
-                BLACK,
-            )
-            self.rect(
-                (x1 - 2 - width * rng.uniform(0.1, 0.18), y + 0.25 * step, x1 - 2, y + 0.65 * step),
-                BLACK,
-            )
+            top, low = y + 0.25 * step, y + 0.65 * step
+            self.rect((x0 + 2, top, x0 + 2 + width * rng.uniform(0.25, 0.5), low), BLACK)
+            self.rect((x1 - 2 - width * rng.uniform(0.1, 0.18), top, x1 - 2, low), BLACK)
             self.rect((x0 + 1.5, y + 0.92 * step, x1 - 1.5, y + step), GREY)
         return self
 
@@ -164,14 +146,12 @@ class Canvas:
         """Print a star burst."""
         angle = np.arange(2 * points) * np.pi / points
         radius = np.where(np.arange(2 * points) % 2 == 0, outer, inner)
-        return self.polygon(
-            [(x + r * np.sin(a), y - r * np.cos(a)) for a, r in zip(angle, radius, strict=True)],
-            color,
-        )
+        tips = zip(x + radius * np.sin(angle), y - radius * np.cos(angle), strict=True)
+        return self.polygon(list(tips), color)
 
     def cracker(self, x: float, y: float, size: float, turn_deg: float) -> "Canvas":
         """Print a square cracker with its holes."""
-        turn = np.deg2rad(turn_deg)
+        turn, middle = np.deg2rad(turn_deg), np.array([x, y])
         R = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
         teeth = np.linspace(-1, 1, 9)
         edge = [(t, -1.0 + 0.07 * (i % 2)) for i, t in enumerate(teeth)]
@@ -180,11 +160,9 @@ class Canvas:
             quarter = np.linalg.matrix_power(np.array([[0.0, -1.0], [1.0, 0.0]]), k)
             outline += [tuple(quarter @ np.array(p)) for p in edge[:-1]]
         for grow, color in ((1.05, (150, 82, 20)), (1.0, (226, 150, 50)), (0.82, (240, 178, 76))):
-            self.polygon(
-                [tuple(np.array([x, y]) + R @ np.array(p) * size / 2 * grow) for p in outline],
-                color,
-            )
+            corners = [middle + R @ np.array(p) * size / 2 * grow for p in outline]
+            self.polygon([tuple(corner) for corner in corners], color)
         for hole in np.array([(i, j) for i in (-0.45, 0.0, 0.45) for j in (-0.45, 0.0, 0.45)]):
-            cx, cy = np.array([x, y]) + R @ hole * size / 2
+            cx, cy = middle + R @ hole * size / 2
             self.ellipse(cx, cy, size * 0.035, size * 0.035, (140, 78, 24))
         return self

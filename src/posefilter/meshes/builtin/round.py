@@ -37,12 +37,8 @@ Profile = list[tuple[float, ...]]
 def texture(side: Canvas, lid: Canvas, base: Canvas, swatch: Canvas) -> np.ndarray:
     """Lay out the four prints.  -> (512, 512, 3) uint8 RGB."""
     upper = _fit(side, TEXTURE, TEXTURE - _STRIP)
-    lower = [
-        _fit(lid, _STRIP, _STRIP),
-        _fit(base, _STRIP, _STRIP),
-        _fit(swatch, TEXTURE - 2 * _STRIP, _STRIP),
-    ]
-    return np.concatenate([upper, np.concatenate(lower, axis=1)])
+    flat, rest = [_fit(page, _STRIP, _STRIP) for page in (lid, base)], TEXTURE - 2 * _STRIP
+    return np.vstack([upper, np.hstack([*flat, _fit(swatch, rest, _STRIP)])])
 
 
 def _fit(page: Canvas, width: int, height: int) -> np.ndarray:
@@ -53,9 +49,8 @@ def _metal_lid(radius_mm: float) -> Canvas:
     size = 2 * radius_mm
     page = Canvas(size, size, METAL)
     for share, shade in ((0.86, 150), (0.82, 205), (0.62, 168), (0.58, 196)):
-        page.ellipse(
-            radius_mm, radius_mm, share * radius_mm, share * radius_mm, (shade, shade, shade + 2)
-        )
+        ring = share * radius_mm
+        page.ellipse(radius_mm, radius_mm, ring, ring, (shade, shade, shade + 2))
     return page
 
 
@@ -194,15 +189,8 @@ def mustard_bottle() -> Mesh:
         "YELLOW", (100, 106, 150, 118), YELLOW, 0.13
     )
     page.polygon([(112, 124), (138, 124), (125, 142)], YELLOW)
-    return _bottle(
-        "mustard_bottle",
-        body,
-        cap,
-        2.4,
-        page,
-        YELLOW,
-        Canvas(50, 50, RED).rect((0, 44, 50, 50), (150, 10, 20)),
-    )
+    caps = Canvas(50, 50, RED).rect((0, 44, 50, 50), (150, 10, 20))
+    return _bottle("mustard_bottle", body, cap, 2.4, page, YELLOW, caps)
 
 
 def bleach_bottle() -> Mesh:
@@ -240,12 +228,5 @@ def bleach_bottle() -> Mesh:
         (238, 98, 270, 180), 83
     )
     page.polygon([(254, 190), (240, 216), (268, 216)], YELLOW)
-    return _bottle(
-        "bleach_bottle",
-        body,
-        cap,
-        2.6,
-        page,
-        WHITE,
-        Canvas(50, 50, BLUE).rect((0, 40, 50, 42), NAVY),
-    )
+    caps = Canvas(50, 50, BLUE).rect((0, 40, 50, 42), NAVY)
+    return _bottle("bleach_bottle", body, cap, 2.6, page, WHITE, caps)
