@@ -82,8 +82,8 @@ def test_symmetries_move_with_the_object_and_survive_the_file(tmp_path: Path) ->
 
     file = tmp_path / "symmetries.json"
     size = diameter(mesh.vertices)
-    file.write_text(json.dumps(describe_symmetries(turns, size, scale=0.001)))
-    again = read_symmetries(file, "anything", 0.001, 36)
+    file.write_text(json.dumps(describe_symmetries(turns, size)))
+    again = read_symmetries(file, "anything", 1.0, 36)
     np.testing.assert_allclose(again, make_group(turns, size), atol=1e-9)
 
 

@@ -16,7 +16,7 @@ from posefilter.data.frames import NotShown, Sample
 from posefilter.data.readers.registry import open_reader
 from posefilter.errors import UserError
 from posefilter.meshes.mesh import face_areas, object_model
-from posefilter.meshes.parts import assign, cut_part, read_parts, select_box
+from posefilter.meshes.parts import assign, read_parts, take_faces
 from posefilter.meshes.store import MeshStore
 from posefilter.metrics.parts import PartIoU, label_pixels
 from posefilter.rendering.embree import render_depth
@@ -76,7 +76,7 @@ def test_a_box_is_in_the_unit_of_the_mesh_file(tmp_path: Path, meshes: MeshStore
 
 def test_a_face_belongs_to_the_first_part_that_has_it(meshes: MeshStore) -> None:
     mesh = meshes.load("obj_000002")
-    everything = select_box(mesh, np.full(3, -1.0), np.full(3, 1.0))
+    everything = np.ones(len(mesh.faces), bool)
     parts = assign({"foot": mesh.parts["foot"], "rest": everything}, "here")
     np.testing.assert_array_equal(parts["rest"], mesh.parts["post"])
 
@@ -242,7 +242,7 @@ def test_a_checkpoint_keeps_the_parts_and_foreign_ones_are_checked(meshes: MeshS
 def test_a_cut_part_keeps_color_and_normals(meshes: MeshStore) -> None:
     mesh = meshes.load("obj_000002")
     colored = replace(mesh, corner_colors=np.arange(24 * 9, dtype=np.float32).reshape(24, 3, 3))
-    part = cut_part(colored, "post")
+    part = take_faces(colored, colored.parts["post"], "obj_000002.post")
     assert part.corner_colors is not None
     np.testing.assert_array_equal(part.corner_colors, colored.corner_colors[12:])
     np.testing.assert_array_equal(part.corner_normals, mesh.corner_normals[12:])

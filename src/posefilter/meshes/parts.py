@@ -96,25 +96,10 @@ def assign(wholes: Mapping[str, np.ndarray], said: str) -> dict[str, np.ndarray]
     return out
 
 
-def select_box(mesh: Mesh, low: np.ndarray, high: np.ndarray) -> np.ndarray:
-    """Return the faces whose center is in a box.  (3,), (3,) [m] -> (F,) bool."""
-    center = mesh.vertices[mesh.faces].mean(axis=1)
-    inside: np.ndarray = ((center >= low) & (center <= high)).all(axis=1)
-    return inside
-
-
-def cut_part(mesh: Mesh, part: str) -> Mesh:
-    """Return a part as a mesh of its own, in the frame of the whole; it has no symmetries.
-
-    Args:
-        mesh: The whole.
-        part: One of its parts.
-    """
-    return take_faces(mesh, mesh.parts[part], f"{mesh.name}{SEPARATOR}{part}")
-
-
 def take_faces(mesh: Mesh, keep: np.ndarray, name: str) -> Mesh:
-    """Return some faces of a mesh as a mesh.  keep: (F,) bool."""
+    """Return some faces of a mesh, such as a part's, as a mesh in its frame, which has no
+    symmetries.  keep: (F,) bool.
+    """
     used, faces = np.unique(mesh.faces[keep], return_inverse=True)
     return replace(
         mesh,
@@ -136,7 +121,10 @@ def _select(one: Any, scale: float, mesh: Mesh, said: str) -> np.ndarray:
             corners = np.array(one["box"], dtype=np.float64).reshape(2, 3) * scale
             if not np.isfinite(corners).all():
                 raise ValueError("a corner is not finite")
-            return select_box(mesh, corners.min(axis=0), corners.max(axis=0))
+            low, high = corners.min(axis=0), corners.max(axis=0)
+            center = mesh.vertices[mesh.faces].mean(axis=1)
+            inside: np.ndarray = ((center >= low) & (center <= high)).all(axis=1)
+            return inside
         if set(one) == {"vertices"}:
             listed = np.array(one["vertices"])
             if listed.ndim != 1 or listed.dtype.kind not in "iu":

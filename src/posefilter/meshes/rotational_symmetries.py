@@ -85,23 +85,16 @@ def list_discrete(turns: Sequence[RotationalSymmetry], size: float) -> list[np.n
     return group[1:]
 
 
-def describe_symmetries(
-    turns: Sequence[RotationalSymmetry], size: float, scale: float = 1.0
-) -> dict[str, Any]:
-    """Return symmetries in the BOP challenge's format.
+def describe_symmetries(turns: Sequence[RotationalSymmetry], size: float) -> dict[str, Any]:
+    """Return what `select` returns in the BOP challenge's format, in meters.
 
-    Args:
-        turns: What `select` returns.
-        size: The object's diameter [m].
-        scale: Meters a unit of the file that the result is to stand beside.
+    `size`: the object's diameter [m].
     """
-    discrete = [matrix.copy() for matrix in list_discrete(turns, size)]
-    for matrix in discrete:
-        matrix[:3, 3] /= scale
+    discrete = list_discrete(turns, size)
     return {
         "symmetries_discrete": [matrix.reshape(-1).tolist() for matrix in discrete],
         "symmetries_continuous": [
-            {"axis": turn.axis.tolist(), "offset": (turn.point / scale).tolist()}
+            {"axis": turn.axis.tolist(), "offset": turn.point.tolist()}
             for turn in turns
             if turn.fold == ANY
         ],

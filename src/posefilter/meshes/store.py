@@ -14,7 +14,7 @@ from posefilter.meshes import ycb
 from posefilter.meshes.builtin import catalog as builtin
 from posefilter.meshes.files import SUFFIXES, read_mesh
 from posefilter.meshes.mesh import Mesh, diameter, object_model
-from posefilter.meshes.parts import FILE, cut_part, declares_parts, read_parts, split_part
+from posefilter.meshes.parts import FILE, declares_parts, read_parts, split_part, take_faces
 from posefilter.meshes.symmetries import declares, identity_first, read_symmetries, symmetry_group
 
 __all__ = ["Mesh", "MeshStore", "object_model", "symmetry_group"]
@@ -138,7 +138,7 @@ class MeshStore:
         if part not in mesh.parts:
             declared = ", ".join(mesh.parts) or f"none (they would be in {FILE} beside the mesh)"
             raise UserError(f"no part '{part}' of {base} in {self.root}; there are: {declared}")
-        return cut_part(mesh, part)
+        return take_faces(mesh, mesh.parts[part], name)
 
     def _parts(self, name: str, mesh: Mesh) -> dict[str, np.ndarray]:
         """Return the declared parts of an object of a folder."""
