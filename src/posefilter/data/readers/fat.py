@@ -25,7 +25,6 @@ from posefilter.data.readers.decode import (
 )
 from posefilter.data.readers.fat_settings import (
     FRAME,
-    IMAGE,
     FatCamera,
     FatClass,
     camera_from_aligned,
@@ -185,10 +184,7 @@ class FatReader(BaseReader):
             if name in classes:
                 self._remember(name, classes[name], folder)
         names = set(list_folder(folder))
-        stems = {f"{m[1]}.{m[2]}" for m in map(IMAGE.match, names) if m} | {
-            n[:-5] for n in names if FRAME.match(n)
-        }
-        for stem in sorted(stems):
+        for stem in sorted({found[1] for found in map(FRAME.match, names) if found}):
             frame, camera = stem.split(".")
             if camera not in self.cameras:
                 continue

@@ -19,8 +19,7 @@ from posefilter.limits import MOST_SIDE, read_json
 from posefilter.paths import is_plain_name
 
 CM = 0.01  # meters a centimeter
-FRAME = re.compile(r"^(\d+)\.(left|right)\.json$")
-IMAGE = re.compile(r"^(\d+)\.(left|right)\.(jpg|png)$")
+FRAME = re.compile(r"^(\d+\.(?:left|right))\.(?:json|jpg|png)$")
 _DEEPEST = 6  # folders between the dataset's and a scene's
 _NEWER = re.compile(r"\.(cs|is|depth\.16|depth\.cm\.\d+)\.png$")
 
@@ -50,7 +49,7 @@ def scene_folders(root: Path, subsets: set[str], deep: int = 0) -> Iterator[Path
     if deep > _DEEPEST:
         raise UserError(f"{root}: folders nested more than {_DEEPEST} deep; a link to itself?")
     names = list_folder(root)
-    if "_object_settings.json" in names or any(FRAME.match(n) or IMAGE.match(n) for n in names):
+    if "_object_settings.json" in names or any(map(FRAME.match, names)):
         yield root
         return
     if any(_NEWER.search(name) for name in names):
