@@ -44,9 +44,8 @@ def _front() -> Canvas:
     page.fade((0, 0, 164, 213), (218, 34, 36), (150, 8, 26))
     page.burst(106, 140, 70, 56, (232, 80, 30), 24).burst(106, 140, 54, 44, YELLOW, 24)
     page.polygon([(0, 16), (164, 4), (164, 56), (0, 68)], NAVY)
-    page.polygon([(0, 19), (164, 7), (164, 9), (0, 21)], YELLOW).polygon(
-        [(0, 63), (164, 51), (164, 53), (0, 65)], YELLOW
-    )
+    page.polygon([(0, 19), (164, 7), (164, 9), (0, 21)], YELLOW)
+    page.polygon([(0, 63), (164, 51), (164, 53), (0, 65)], YELLOW)
     page.text(_BRAND, (10, 14, 154, 60), WHITE, 0.17)
     page.text("WHEAT CRACKERS", (10, 70, 110, 84), WHITE, 0.12)
     for x, y, size, turn in (
@@ -58,21 +57,18 @@ def _front() -> Canvas:
     ):
         page.cracker(x, y, size, turn)
     page.ellipse(26, 112, 19, 19, GREEN).ellipse(26, 112, 16.5, 16.5, WHITE, line_mm=0.8)
-    page.text("WHOLE", (12, 101, 40, 110), WHITE, 0.14).text(
-        "GRAIN", (12, 112, 40, 121), WHITE, 0.14
-    )
+    page.text("WHOLE", (12, 101, 40, 110), WHITE, 0.14)
+    page.text("GRAIN", (12, 112, 40, 121), WHITE, 0.14)
     page.text("NET 350 g", (6, 200, 44, 210), WHITE, 0.1)
     return page
 
 
 def _back() -> Canvas:
     page = Canvas(164, 213, CREAM)
-    page.rect((0, 0, 164, 34), BLUE).text(_BRAND, (8, 5, 78, 30), WHITE, 0.17).text(
-        "SNACK IDEAS", (84, 9, 158, 26), YELLOW, 0.12
-    )
-    page.ellipse(52, 84, 42, 36, SKY).ellipse(52, 84, 34, 28, WHITE).ellipse(
-        52, 84, 28, 22, (212, 70, 40)
-    )
+    page.rect((0, 0, 164, 34), BLUE).text(_BRAND, (8, 5, 78, 30), WHITE, 0.17)
+    page.text("SNACK IDEAS", (84, 9, 158, 26), YELLOW, 0.12)
+    page.ellipse(52, 84, 42, 36, SKY).ellipse(52, 84, 34, 28, WHITE)
+    page.ellipse(52, 84, 28, 22, (212, 70, 40))
     for x, y, color in (
         (42, 78, GREEN),
         (60, 92, YELLOW),
@@ -85,9 +81,8 @@ def _back() -> Canvas:
     page.text("TOMATO DIP", (104, 44, 160, 56), RED, 0.12).lines((106, 60, 160, 120), BROWN, 4.2, 1)
     page.rect((0, 128, 164, 132), BLUE)
     page.rect((8, 138, 76, 206), WHITE).rect((8, 138, 76, 206), GREEN, 1.2)
-    page.text("INGREDIENTS", (11, 140, 73, 150), GREEN, 0.12).lines(
-        (12, 152, 73, 203), BLACK, 3.6, 2
-    )
+    page.text("INGREDIENTS", (11, 140, 73, 150), GREEN, 0.12)
+    page.lines((12, 152, 73, 203), BLACK, 3.6, 2)
     page.lines((84, 138, 158, 168), BLUE, 3.8, 3)
     page.barcode((96, 174, 156, 207), 4)
     return page
@@ -124,13 +119,11 @@ def _top() -> Canvas:
 def _bottom() -> Canvas:
     page = Canvas(164, 72, KRAFT)
     page.rect((0, 34.5, 164, 37.5), (132, 98, 62))
-    page.text("BEST BEFORE 0427", (8, 8, 88, 20), BLACK, 0.1).lines(
-        (8, 44, 70, 66), (92, 62, 36), 4, 7
-    )
+    page.text("BEST BEFORE 0427", (8, 8, 88, 20), BLACK, 0.1)
+    page.lines((8, 44, 70, 66), (92, 62, 36), 4, 7)
     page.barcode((100, 6, 154, 30), 8)
-    page.polygon([(122, 66), (136, 42), (150, 66)], (60, 96, 50)).polygon(
-        [(130, 62), (136, 51), (142, 62)], KRAFT
-    )
+    page.polygon([(122, 66), (136, 42), (150, 66)], (60, 96, 50))
+    page.polygon([(130, 62), (136, 51), (142, 62)], KRAFT)
     return page
 
 
@@ -143,32 +136,26 @@ def sugar_faces() -> dict[str, np.ndarray]:
     front.text("DULSA", (13, 46, width - 13, 78), WHITE, 0.18)
     front.text("SUGAR", (16, 98, width - 16, 122), NAVY, 0.16)
     for x, y in ((30, 148), (48, 152), (40, 138), (62, 146), (54, 136)):
-        front.rect((x - 7, y - 7, x + 7, y + 7), (214, 214, 206)).rect(
-            (x - 6, y - 6, x + 5, y + 5), WHITE
-        )
+        front.rect((x - 7, y - 7, x + 7, y + 7), (214, 214, 206))
+        front.rect((x - 6, y - 6, x + 5, y + 5), WHITE)
     front.text("1 kg", (66, 158, 90, 172), NAVY, 0.12)
     back = Canvas(width, height, WHITE)
     back.rect((0, 0, width, 22), YELLOW).text("BAKE WITH DULSA", (6, 4, width - 6, 18), NAVY, 0.12)
-    back.ellipse(46, 62, 30, 12, ORANGE).ellipse(46, 54, 26, 14, (150, 92, 44)).ellipse(
-        46, 46, 20, 7, CREAM
-    )
-    back.lines((8, 86, width - 8, 128), NAVY, 4, 11).barcode((40, 136, 86, 168), 12).ellipse(
-        20, 152, 12, 12, GREEN
-    )
+    back.ellipse(46, 62, 30, 12, ORANGE).ellipse(46, 54, 26, 14, (150, 92, 44))
+    back.ellipse(46, 46, 20, 7, CREAM)
+    back.lines((8, 86, width - 8, 128), NAVY, 4, 11).barcode((40, 136, 86, 168), 12)
+    back.ellipse(20, 152, 12, 12, GREEN)
     left = Canvas(depth, height, NAVY)
-    left.nutrition((4, 14, depth - 4, 112), 13).text(
-        "DULSA", (4, 122, depth - 4, 140), YELLOW, 0.16
-    )
+    left.nutrition((4, 14, depth - 4, 112), 13)
+    left.text("DULSA", (4, 122, depth - 4, 140), YELLOW, 0.16)
     left.lines((6, 146, depth - 6, 170), WHITE, 3.6, 14)
     right = Canvas(depth, height, YELLOW)
-    right.text("DULSA", (8, 8, depth - 8, 120), BLUE, 0.18, turned=True).ellipse(
-        depth / 2, 146, 16, 16, RED
-    )
+    right.text("DULSA", (8, 8, depth - 8, 120), BLUE, 0.18, turned=True)
+    right.ellipse(depth / 2, 146, 16, 16, RED)
     right.text("NEW", (depth / 2 - 13, 138, depth / 2 + 13, 154), WHITE, 0.16)
     top = Canvas(width, depth, YELLOW)
-    top.rect((0, 0, width, 8), NAVY).text("SUGAR", (8, 12, 60, 40), NAVY, 0.16).ellipse(
-        76, 26, 11, 11, GREY
-    )
+    top.rect((0, 0, width, 8), NAVY).text("SUGAR", (8, 12, 60, 40), NAVY, 0.16)
+    top.ellipse(76, 26, 11, 11, GREY)
     bottom = Canvas(width, depth, GREY)
     bottom.lines((8, 8, 50, 38), BLACK, 4.2, 15).rect((60, 10, 84, 34), WHITE)
     return _six(front, back, left, right, top, bottom)
@@ -182,13 +169,11 @@ def gelatin_faces() -> dict[str, np.ndarray]:
     front.fade((0, 0, width, height), (236, 60, 110), berry)
     front.text("WOBBLI", (5, 5, 84, 28), WHITE, 0.18)
     for x, y in ((24, 52), (38, 60), (30, 40)):
-        front.ellipse(x, y, 9, 10, RED).ellipse(x - 3, y - 3, 1.4, 1.8, YELLOW).ellipse(
-            x + 3, y + 2, 1.4, 1.8, YELLOW
-        )
+        front.ellipse(x, y, 9, 10, RED).ellipse(x - 3, y - 3, 1.4, 1.8, YELLOW)
+        front.ellipse(x + 3, y + 2, 1.4, 1.8, YELLOW)
         front.polygon([(x - 6, y - 8), (x + 6, y - 8), (x, y - 13)], GREEN)
-    front.polygon([(54, 66), (60, 40), (78, 40), (84, 66)], pink).ellipse(
-        69, 40, 9, 3, (250, 170, 196)
-    )
+    front.polygon([(54, 66), (60, 40), (78, 40), (84, 66)], pink)
+    front.ellipse(69, 40, 9, 3, (250, 170, 196))
     back = Canvas(width, height, WHITE)
     back.rect((0, 0, width, 14), pink).text("HOW TO MAKE", (6, 2, 60, 12), WHITE, 0.13)
     back.lines((6, 20, 52, 66), berry, 3.6, 21).barcode((56, 34, 84, 62), 22)

@@ -88,14 +88,12 @@ def soup_can() -> Mesh:
     page.rect((0, 0.5 * tall, round_mm, tall), WHITE)
     mid = round_mm / 2
     page.text("POMODORA", (mid - 32, 14, mid + 32, 38), WHITE, 0.17)
-    page.ellipse(mid, 52, 15, 15, YELLOW).ellipse(mid, 52, 12, 12, ORANGE).polygon(
-        [(mid, 34), (mid - 7, 46), (mid + 7, 46)], GREEN
-    )
+    page.ellipse(mid, 52, 15, 15, YELLOW).ellipse(mid, 52, 12, 12, ORANGE)
+    page.polygon([(mid, 34), (mid - 7, 46), (mid + 7, 46)], GREEN)
     page.text("TOMATO SOUP", (mid - 30, 70, mid + 30, 90), RED, 0.14)
     page.nutrition((8, 54, 42, 97), 41).barcode((round_mm - 46, 60, round_mm - 10, 92), 42)
-    page.lines((10, 12, 50, 46), WHITE, 4, 43).lines(
-        (round_mm - 48, 12, round_mm - 8, 46), YELLOW, 4, 44
-    )
+    page.lines((10, 12, 50, 46), WHITE, 4, 43)
+    page.lines((round_mm - 48, 12, round_mm - 8, 46), YELLOW, 4, 44)
     page.rect((0, 0, round_mm, 3.5), METAL).rect((0, tall - 3.5, round_mm, tall), METAL)
     return _can("soup_can", radius, height, page, _metal_lid(1000 * radius))
 
@@ -108,9 +106,8 @@ def coffee_can() -> Mesh:
     page.fade((0, 0, round_mm, tall), (30, 66, 150), (10, 22, 66))
     mid = round_mm / 2
     page.text("MONTE NERO", (mid - 47, 24, mid + 47, 56), WHITE, 0.16)
-    page.ellipse(mid, 92, 34, 22, CREAM).ellipse(mid, 92, 30, 18, BROWN).ellipse(
-        mid, 92, 3, 18, CREAM, 18
-    )
+    page.ellipse(mid, 92, 34, 22, CREAM).ellipse(mid, 92, 30, 18, BROWN)
+    page.ellipse(mid, 92, 3, 18, CREAM, 18)
     page.text("GROUND COFFEE", (mid - 42, 118, mid + 42, 132), YELLOW, 0.12)
     for x in (30, 62, round_mm - 30, round_mm - 62):
         page.ellipse(x, 30, 11, 8, BROWN, 30).ellipse(x, 30, 1.4, 8, BLACK, 30)
@@ -119,9 +116,8 @@ def coffee_can() -> Mesh:
     page.rect((0, 0, round_mm, 8), WHITE).rect((0, tall - 4, round_mm, tall), METAL)
     size = 2000 * radius
     lid = Canvas(size, size, WHITE)
-    lid.ellipse(size / 2, size / 2, 0.42 * size, 0.42 * size, (226, 228, 232)).text(
-        "FRESH", (24, 40, 78, 62), GREY, 0.12
-    )
+    lid.ellipse(size / 2, size / 2, 0.42 * size, 0.42 * size, (226, 228, 232))
+    lid.text("FRESH", (24, 40, 78, 62), GREY, 0.12)
     return _can("coffee_can", radius, height, page, lid)
 
 
@@ -131,9 +127,8 @@ def tuna_can() -> Mesh:
     round_mm, tall = 2000 * np.pi * radius, 1000 * height
     page = Canvas(round_mm, tall, BLUE)
     mid = round_mm / 2
-    page.rect((0, 22, round_mm, 26), YELLOW).text(
-        "MAREA TUNA", (mid - 38, 6, mid + 38, 21), WHITE, 0.16
-    )
+    page.rect((0, 22, round_mm, 26), YELLOW)
+    page.text("MAREA TUNA", (mid - 38, 6, mid + 38, 21), WHITE, 0.16)
     page.barcode((8, 7, 44, 27), 61).lines((round_mm - 60, 7, round_mm - 8, 21), WHITE, 3.6, 62)
     page.rect((0, 0, round_mm, 3), METAL).rect((0, tall - 3, round_mm, tall), METAL)
     size = 2000 * radius
@@ -185,9 +180,8 @@ def mustard_bottle() -> Mesh:
         )
     page.rect((0, 56, 32, 148), RED).rect((218, 56, 250, 148), RED)
     page.barcode((4, 70, 30, 110), 71).lines((220, 66, 246, 140), WHITE, 4.5, 72)
-    page.text("SENAPO", (93, 72, 157, 84), YELLOW, 0.16).text(
-        "YELLOW", (100, 106, 150, 118), YELLOW, 0.13
-    )
+    page.text("SENAPO", (93, 72, 157, 84), YELLOW, 0.16)
+    page.text("YELLOW", (100, 106, 150, 118), YELLOW, 0.13)
     page.polygon([(112, 124), (138, 124), (125, 142)], YELLOW)
     caps = Canvas(50, 50, RED).rect((0, 44, 50, 50), (150, 10, 20))
     return _bottle("mustard_bottle", body, cap, 2.4, page, YELLOW, caps)
@@ -219,14 +213,12 @@ def bleach_bottle() -> Mesh:
     page = Canvas(274, 234, WHITE)
     page.fade((90, 84, 184, 226), (24, 96, 190), (10, 40, 120))
     page.burst(137, 148, 44, 30, SKY, 12).ellipse(137, 148, 28, 22, WHITE)
-    page.text("BLANKA", (93, 90, 181, 116), WHITE, 0.17).text(
-        "PLUS", (117, 138, 157, 158), RED, 0.18
-    )
+    page.text("BLANKA", (93, 90, 181, 116), WHITE, 0.17)
+    page.text("PLUS", (117, 138, 157, 158), RED, 0.18)
     page.text("CLEANER", (98, 194, 176, 212), YELLOW, 0.15)
     page.rect((0, 90, 40, 226), GREEN).rect((234, 90, 274, 226), GREEN)
-    page.lines((4, 100, 36, 180), WHITE, 4.5, 81).barcode((4, 186, 36, 220), 82).nutrition(
-        (238, 98, 270, 180), 83
-    )
+    page.lines((4, 100, 36, 180), WHITE, 4.5, 81).barcode((4, 186, 36, 220), 82)
+    page.nutrition((238, 98, 270, 180), 83)
     page.polygon([(254, 190), (240, 216), (268, 216)], YELLOW)
     caps = Canvas(50, 50, BLUE).rect((0, 40, 50, 42), NAVY)
     return _bottle("bleach_bottle", body, cap, 2.6, page, WHITE, caps)

@@ -75,9 +75,8 @@ def mug() -> Mesh:
         (r, height),
     ]
     page = Canvas(292, 84, (176, 30, 36))
-    page.ellipse(146, 44, 30, 26, CREAM).text("HELLO", (122, 30, 170, 50), NAVY, 0.17).text(
-        "DAY", (134, 50, 158, 62), ORANGE, 0.17
-    )
+    page.ellipse(146, 44, 30, 26, CREAM).text("HELLO", (122, 30, 170, 50), NAVY, 0.17)
+    page.text("DAY", (134, 50, 158, 62), ORANGE, 0.17)
     for k, color in enumerate((NAVY, CREAM, ORANGE)):
         page.polygon([(10 + 18 * k, 60), (20 + 18 * k, 24), (30 + 18 * k, 60)], color)
         page.ellipse(232 + 20 * k, 42, 9, 9, color)
@@ -133,9 +132,8 @@ def pitcher() -> Mesh:
     page.fade((0, 0, 400, 250), (60, 120, 210), (24, 66, 158)).rect((0, 0, 400, 12), WHITE)
     for k in range(9):
         page.rect((186, 60 + 18 * k, 206 if k % 2 else 216, 62 + 18 * k), WHITE)
-    page.text("AQUA", (166, 22, 234, 50), WHITE, 0.17).ellipse(20, 140, 16, 22, SKY).polygon(
-        [(6, 132), (34, 132), (20, 92)], SKY
-    )
+    page.text("AQUA", (166, 22, 234, 50), WHITE, 0.17).ellipse(20, 140, 16, 22, SKY)
+    page.polygon([(6, 132), (34, 132), (20, 92)], SKY)
     inside = Canvas(50, 50, (70, 130, 214)).rect((0, 0, 50, 6), WHITE)
     floor = Canvas(50, 50, (44, 98, 186))
     body = _vessel(outside, 0.003, 0.006, 40)
@@ -195,9 +193,8 @@ def banana() -> Mesh:
         flat, np.eye(3), -np.array([(low[0] + high[0]) / 2, (low[1] + high[1]) / 2, low[2]])
     )
     page = Canvas(120, 210, (240, 204, 60))
-    page.fade((0, 0, 120, 26), (120, 130, 40), (232, 204, 66)).fade(
-        (0, 186, 120, 210), (236, 200, 60), (90, 64, 30)
-    )
+    page.fade((0, 0, 120, 26), (120, 130, 40), (232, 204, 66))
+    page.fade((0, 186, 120, 210), (236, 200, 60), (90, 64, 30))
     page.rect((0, 0, 120, 5), BROWN).rect((0, 204, 120, 210), (50, 36, 22))
     rng = np.random.default_rng(101)
     for _ in range(70):
