@@ -106,11 +106,8 @@ def format_report(report: dict[str, Any]) -> str:
     lines = [f"  - {problem}" for problem in report["problems"]]
     left_out = report["left_out"]
     note = f"left out, look-alikes without a mesh: {', '.join(left_out)}\n" if left_out else ""
-    return (
-        console.export_text()
-        + note
-        + ("\n".join(["problems:", *lines]) if lines else "no problems found")
-    )
+    found = "\n".join(["problems:", *lines]) if lines else "no problems found"
+    return console.export_text() + note + found
 
 
 def _check_object(
@@ -166,11 +163,9 @@ def _check_object(
     # what is wrong with most frames is told once
     single = [one for one in suspects if one.flaw] if general else suspects
     explained = any("no cause" not in problem for problem in general)
-    return (
-        row,
-        [*problems, *general, *([] if explained else describe_suspects(single, geometry))],
-        tiles,
-    )
+    if not explained:
+        general += describe_suspects(single, geometry)
+    return row, problems + general, tiles
 
 
 def _judge(

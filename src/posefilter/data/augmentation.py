@@ -71,11 +71,8 @@ class RollAndZoom:
 
     def __call__(self, sample: Sample, draw: Draw, rng: Generator) -> Sample:
         """Return the sample as the turned and zoomed camera sees it."""
-        angle = (
-            rng.uniform(-np.pi, np.pi)
-            if rng.random() < self.uniform_roll_probability
-            else rng.normal() * self.roll
-        )
+        uniform = rng.random() < self.uniform_roll_probability
+        angle = rng.uniform(-np.pi, np.pi) if uniform else rng.normal() * self.roll
         zoom = float(np.exp(rng.uniform(*np.log(self.zoom))))
         # without this choice nothing is drawn for it: other trainings stay as they were
         if self.object_size_probability and rng.random() < self.object_size_probability:
@@ -142,13 +139,8 @@ class RandomCrop:
         cut = np.s_[top : top + h, left : left + w]
         K = sample.intrinsics.copy()
         K[:2, 2] -= (left, top)
-        return dataclasses.replace(
-            sample,
-            rgb=sample.rgb[cut].copy(),
-            depth=sample.depth[cut].copy(),
-            mask=sample.mask[cut].copy(),
-            intrinsics=K,
-        )
+        rgb, depth, mask = (x[cut].copy() for x in (sample.rgb, sample.depth, sample.mask))
+        return dataclasses.replace(sample, rgb=rgb, depth=depth, mask=mask, intrinsics=K)
 
 
 def draw_rectangle(

@@ -166,20 +166,22 @@ class PoseDataModule(LightningDataModule):
 
     @cached_property
     def _decoder(self) -> FrameDecoder:
-        size = f"{self._image_width}x{self._image_height}"
+        size = self._image_width, self._image_height
         options = sorted(self._options.items())
         root = str(self.meshes.root)
         root = root if root == BUILTIN else str(Path(root).resolve())
         meshes = (root, self.meshes.describe_files(self.objects))
-        content = (self.source, self.root.resolve(), self.objects, meshes, size, options)
-        folder = Path(self._cache_dir or self.root / ".cache")
-        return FrameDecoder(
-            self.reader,
-            self._records,
-            self._image_width,
-            self._image_height,
-            partial(open_cache, self._cache_kind, folder, f"1 {content}"),
+        content = (
+            self.source,
+            self.root.resolve(),
+            self.objects,
+            meshes,
+            "{}x{}".format(*size),
+            options,
         )
+        folder = Path(self._cache_dir or self.root / ".cache")
+        cache = partial(open_cache, self._cache_kind, folder, f"1 {content}")
+        return FrameDecoder(self.reader, self._records, *size, cache)
 
     def prepare_data(self) -> None:
         """Render the scenes if the source is `scenes` and they do not exist yet."""
@@ -206,9 +208,8 @@ class PoseDataModule(LightningDataModule):
                 f"{name}: builtin meshes are not the objects of real photographs; "
                 f"give data.meshes=DIR"
             )
-        points = read_model_points(
-            self._model_points_dir, self.root, name, self.reader.native_from_mesh(name)
-        )
+        native = self.reader.native_from_mesh(name)
+        points = read_model_points(self._model_points_dir, self.root, name, native)
         found = object_model(self.meshes.load(name), points=points, count=self._num_model_points)
         self.reader.check_diameter(name, found.diameter)
         return found
@@ -390,6 +391,5 @@ class PoseDataModule(LightningDataModule):
                 f"{self.root}: none of {len(part)} {split} frames can be used: "
                 f"{dict(self._left_out[split])}"
             )
-        return FrameDataset(
-            chosen, self._decoder.cache, self._augment if split == "train" else None, self._seed
-        )
+        augment = self._augment if split == "train" else None
+        return FrameDataset(chosen, self._decoder.cache, augment, self._seed)

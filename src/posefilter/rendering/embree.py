@@ -98,9 +98,8 @@ class EmbreeRenderer(Renderer):
         else:
             stretch = max(float(abs(np.linalg.det(linear))) ** (1 / 3), 1e-6)
             texels_per_meter = mesh.uv_per_meter * max(texture.shape[:2]) / stretch
-            level = self._mipmaps.level(
-                texture, texels_per_meter * float(np.median(hit.t)) / K[0, 0]
-            )
+            density = texels_per_meter * float(np.median(hit.t)) / K[0, 0]
+            level = self._mipmaps.level(texture, density)
             uv = _blend(mesh.uv, hit.face, corner)
             color = sample_texture(level, uv[:, 0], uv[:, 1])
         if mesh.colors is not None:

@@ -135,19 +135,14 @@ class RayCaster:
             center, radius = _bounding_sphere(one, mesh)
             offset = center - points
             along = offset @ L
-            near = (
-                (along > -radius)
-                & ((offset * offset).sum(1) - along * along < radius * radius)
-                & (lit > 0)
-            )
-            where = np.flatnonzero(near)
+            near = (offset * offset).sum(1) - along * along < radius * radius
+            where = np.flatnonzero((along > -radius) & near & (lit > 0))
             if len(where) == 0:
                 continue
             inverse = np.linalg.inv(one.camera_from_object)
             origin = move(points[where], inverse).astype(np.float32)
-            direction = np.broadcast_to(
-                (inverse[:3, :3] @ L).astype(np.float32), origin.shape
-            ).copy()
+            towards = (inverse[:3, :3] @ L).astype(np.float32)
+            direction = np.broadcast_to(towards, origin.shape).copy()
             lit[where[mesh.scene.run(origin, direction, query="OCCLUDED") >= 0]] = 0
         soft = cv2.GaussianBlur(lit.reshape(shape), (0, 0), lights.shadow_blur)
         # cell (i, j) was sampled at pixel stride * i: shift the enlarged map accordingly

@@ -45,7 +45,6 @@ class MipmapCache:
         levels = self._levels[key]
         wanted = int(np.clip(np.floor(np.log2(max(texels_per_pixel, 1e-6)) + 0.25), 0, 6))
         while len(levels) <= wanted and min(levels[-1].shape[:2]) >= 8:
-            levels.append(
-                cv2.resize(levels[-1], None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
-            )
+            half = cv2.resize(levels[-1], None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
+            levels.append(half)
         return levels[min(wanted, len(levels) - 1)]

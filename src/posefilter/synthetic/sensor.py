@@ -118,12 +118,10 @@ def motion_kernel(rng: np.random.Generator, length: int) -> np.ndarray:
 
 def _color_noise(rng: np.random.Generator, height: int, width: int) -> np.ndarray:
     """Return sensor noise of brightness, and coarser noise of color, as demosaicing leaves it."""
-    bright = rng.standard_normal((height, width, 1), dtype=np.float32) * np.float32(
-        rng.uniform(0.004, 0.04)
-    )
-    coarse = rng.standard_normal((height // 2, width // 2, 3), dtype=np.float32) * np.float32(
-        rng.uniform(0.002, 0.03)
-    )
+    bright = rng.standard_normal((height, width, 1), dtype=np.float32)
+    bright *= np.float32(rng.uniform(0.004, 0.04))
+    coarse = rng.standard_normal((height // 2, width // 2, 3), dtype=np.float32)
+    coarse *= np.float32(rng.uniform(0.002, 0.03))
     return bright + cv2.resize(coarse, (width, height), interpolation=cv2.INTER_LINEAR)
 
 
