@@ -7,8 +7,8 @@ itself, since a scan's axes are not exact, and is then judged by distances of tu
 to the nearest of a second, denser sampling.
 """
 
-from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -111,17 +111,13 @@ def _try(
     exact = [rotation_about(axis, angle, point) for angle in angles]
     before = _distances(surface, np.eye(4))
     after = [_distances(surface, turn) for turn in exact]
-    distance = max(_excess(one, before, np.mean) for one in after)
-    far = max(_excess(one, before, lambda d: np.quantile(d, 0.98)) for one in after)
+    distance = float(max(one.mean() for one in after) - before.mean())
+    far = float(max(np.quantile(one, 0.98) for one in after) - np.quantile(before, 0.98))
     color = max(float(np.quantile(_color_change(surface, turn), 0.95)) for turn in exact)
     limit = surface.diameter
     shape = distance <= MEAN_EXCESS * limit and far <= FAR_EXCESS * limit
     texture = shape and color <= MOST_COLOR
     return RotationalSymmetry(axis, point, fold, distance, far, color, shape, texture)
-
-
-def _excess(after: np.ndarray, before: np.ndarray, of: Callable[[np.ndarray], Any]) -> float:
-    return float(of(after) - of(before))
 
 
 def _distances(surface: _Surface, transform: np.ndarray) -> np.ndarray:

@@ -42,8 +42,13 @@ def select(turns: Sequence[RotationalSymmetry], texture: bool = True) -> list[Ro
     """
     good = [turn for turn in turns if turn.texture or not texture]
     continuous = [turn for turn in good if turn.fold == ANY][:2]
-    if not continuous:
-        return _drop_divisors(good)
+    if not continuous:  # a half turn about an axis of quarter turns is two of them
+        quarters = [turn.axis for turn in good if turn.fold == 4]
+        return [
+            turn
+            for turn in good
+            if turn.fold != 2 or not any(are_parallel(axis, turn.axis) for axis in quarters)
+        ]
     across = [
         turn
         for turn in good
@@ -104,17 +109,6 @@ def describe_symmetries(turns: Sequence[RotationalSymmetry], size: float) -> dic
 def are_parallel(a: np.ndarray, b: np.ndarray) -> bool:
     """Tell whether two unit vectors are parallel, within 10 degrees."""
     return bool(abs(a @ b) > _PARALLEL)
-
-
-def _drop_divisors(turns: Sequence[RotationalSymmetry]) -> list[RotationalSymmetry]:
-    """Leave out half turns about an axis that has quarter turns."""
-    return [
-        turn
-        for turn in turns
-        if not (
-            turn.fold == 2 and any(t.fold == 4 and are_parallel(t.axis, turn.axis) for t in turns)
-        )
-    ]
 
 
 def _close(generators: Sequence[np.ndarray], size: float) -> list[np.ndarray]:
