@@ -255,13 +255,10 @@ def check_intrinsics(K: np.ndarray, count: int, size: tuple[int, int] | None = N
     if not np.isfinite(K).all():
         raise UserError("intrinsics: hold NaN or infinity")
     for one in K:
-        flaw = find_matrix_flaw(one)
-        if flaw:
+        if flaw := find_matrix_flaw(one):
             raise UserError(f"intrinsics: are no camera matrix ({flaw})")
-        flaw = "" if size is None else find_focal_flaw(one, size[1])
-        if flaw:
+        if size is not None and (flaw := find_focal_flaw(one, size[1])):
             raise UserError(f"intrinsics: focal lengths are not plausible ({flaw})")
-        flaw = "" if size is None else find_center_flaw(one, size[1], size[0])
-        if flaw:
+        if size is not None and (flaw := find_center_flaw(one, size[1], size[0])):
             raise UserError(f"intrinsics: the principal point is not plausible ({flaw})")
     return K

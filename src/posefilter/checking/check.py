@@ -177,12 +177,9 @@ def _judge(
     depths = [fit.rendered[fit.rendered > 0] for fit in fits]
     distance = float(np.median([np.median(known) if known.size else 1 for known in depths]))
     bad_depth = error is not None and error > max(_DEPTH_MM, _DEPTH_SHARE * distance * 1000)
-    if iou < LEAST_IOU or bad_depth:
-        causes = likely_causes(views, geometry, tried)
-        if causes:
-            return [f"{name}: {cause}" for cause in causes]
-    slip = half_pixel(views, geometry, tried)
-    if slip:
+    if (iou < LEAST_IOU or bad_depth) and (causes := likely_causes(views, geometry, tried)):
+        return [f"{name}: {cause}" for cause in causes]
+    if slip := half_pixel(views, geometry, tried):
         return [f"{name}: {slip}"]
     problems = []
     if iou < LEAST_IOU:

@@ -58,8 +58,7 @@ def describe_suspects(suspects: Sequence[Suspect], geometry: Geometry) -> list[s
 
 def _find_causes(one: Suspect, geometry: Geometry) -> list[str]:
     """Return in words what is probably wrong with a single frame."""
-    causes = likely_causes([one.view], geometry, one.fit.iou)
-    if causes:
+    if causes := likely_causes([one.view], geometry, one.fit.iou):
         return causes
     sample = one.view.sample
     for axis, way in ((1, "left to right"), (0, "upside down")):

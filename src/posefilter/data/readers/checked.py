@@ -63,8 +63,7 @@ def read_checked(reader: BaseReader, i: int, record: FrameRecord) -> Sample:
     """
     sample = reader.read(i)
     named = f"{type(reader).__name__}.read, frame {record.name}"
-    wrong = _find_type_flaw(sample, len(reader.objects))
-    if wrong:
+    if wrong := _find_type_flaw(sample, len(reader.objects)):
         raise UserError(f"{named}: {wrong}")
     file = record.files[0] if record.files else Path(record.name)
     flaw, unit = _find_number_flaw(sample), False
@@ -139,8 +138,7 @@ def _find_number_flaw(sample: Sample) -> tuple[str, str] | None:
     for name, matrix in (("intrinsics", K), ("camera_from_object", pose)):
         if not np.isfinite(matrix).all():
             return f"{name} holds NaN or infinity", str(matrix.tolist())
-    flaw = find_matrix_flaw(K)
-    if flaw:
+    if flaw := find_matrix_flaw(K):
         return "intrinsics are no camera matrix", flaw
     if not is_rigid(torch.from_numpy(pose.astype(np.float64)), _RIGID):
         return "camera_from_object is no rotation and translation", _explain_pose(pose)

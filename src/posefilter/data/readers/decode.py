@@ -171,8 +171,7 @@ def decode_image(data: bytes, path: Path, mode: int = cv2.IMREAD_UNCHANGED) -> n
     Raises:
         BadData: It is damaged, or larger than photographs are.
     """
-    flaw = _flaw(data)
-    if flaw:
+    if flaw := _flaw(data):
         raise BadData(path, "truncated or corrupt image", flaw)
     check_picture(path, data)
     image = None

@@ -29,8 +29,7 @@ def check_camera(K: np.ndarray, path: Path) -> None:
     """
     if not np.isfinite(K).all():
         raise BadData(path, "intrinsics hold NaN or infinity")
-    flaw = find_matrix_flaw(K)
-    if flaw:
+    if flaw := find_matrix_flaw(K):
         raise BadData(path, "intrinsics are no camera matrix", flaw)
 
 
@@ -98,11 +97,9 @@ def check_sample(sample: Sample, camera_from_native: np.ndarray, files: tuple[Pa
     if sample.mask.all():
         raise BadData(label, "the label covers the whole image")
     K, (height, width) = sample.intrinsics, sample.mask.shape
-    flaw = find_focal_flaw(K, width)
-    if flaw:
+    if flaw := find_focal_flaw(K, width):
         raise Implausible(camera, "focal lengths are not plausible", flaw, sample)
-    flaw = find_center_flaw(K, width, height)
-    if flaw:
+    if flaw := find_center_flaw(K, width, height):
         raise Implausible(camera, "principal point is not plausible", flaw, sample)
     z = float(camera_from_native[2, 3])
     if not (z > 0 and math.hypot(*camera_from_native[:3, 3]) <= FARTHEST):
