@@ -57,20 +57,11 @@ def _metal_lid(radius_mm: float) -> Canvas:
 def _can(name: str, radius: float, height: float, side: Canvas, lid: Canvas) -> Mesh:
     """Make a can: rims, a sunken lid and base."""
     inner = radius - 0.0012
-    wall: Profile = [
-        (radius, 0),
-        (radius, 0.002),
-        (inner, 0.0035),
-        (inner, height / 2),
-        (inner, height - 0.0035),
-    ]
-    wall += [(radius, height - 0.002), (radius, height)]
-    top: Profile = [
-        (radius, height),
-        (radius - 0.002, height),
-        (radius - 0.003, height - 0.0025),
-        (0, height - 0.0025),
-    ]
+    wall: Profile = [(radius, 0), (radius, 0.002), (inner, 0.0035), (inner, height / 2)]
+    wall += [(inner, height - 0.0035), (radius, height - 0.002), (radius, height)]
+    sunken = height - 0.0025
+    top: Profile = [(radius, height), (radius - 0.002, height), (radius - 0.003, sunken)]
+    top += [(0, sunken)]
     low: Profile = [(0, 0.002), (radius - 0.003, 0.002), (radius - 0.002, 0), (radius, 0)]
     soup = join(disc(low, BASE, RADIUS, up=False), lathe(wall, SIDE), disc(top, LID, RADIUS))
     base = _metal_lid(1000 * radius)
@@ -157,21 +148,11 @@ def _bottle(
 def mustard_bottle() -> Mesh:
     """Draw a mustard bottle, as large as YCB's."""
     rx, ry, neck = 0.0480, 0.02913, 0.0165
-    body: Profile = [
-        (0.92 * rx, 0.9 * ry, 0),
-        (rx, ry, 0.006),
-        (rx, ry, 0.05),
-        (0.95 * rx, 0.97 * ry, 0.09),
-        (rx, ry, 0.125),
-    ]
-    body += [(0.9 * rx, 0.95 * ry, 0.140), (0.66 * rx, 0.85 * ry, 0.152), (neck, neck, 0.159)]
-    cap: Profile = [
-        (neck, neck, 0.159),
-        (0.0175, 0.0175, 0.160),
-        (0.0165, 0.0165, 0.173),
-        (0.009, 0.009, 0.177),
-    ]
-    cap += [(0.0045, 0.0045, 0.1895), (0.0035, 0.0035, 0.1913), (0, 0, 0.1913)]
+    body: Profile = [(0.92 * rx, 0.9 * ry, 0), (rx, ry, 0.006), (rx, ry, 0.05)]
+    body += [(0.95 * rx, 0.97 * ry, 0.09), (rx, ry, 0.125), (0.9 * rx, 0.95 * ry, 0.140)]
+    body += [(0.66 * rx, 0.85 * ry, 0.152), (neck, neck, 0.159)]
+    cap: Profile = [(neck, 0.159), (0.0175, 0.160), (0.0165, 0.173), (0.009, 0.177)]
+    cap += [(0.0045, 0.1895), (0.0035, 0.1913), (0, 0.1913)]
     page = Canvas(250, 172, YELLOW)  # y = 172 mm less the arc length along the profile
     for x, text in ((125, "MUSTARD"), (250, "SENAPO"), (0, "SENAPO")):
         page.ellipse(x, 102, 40, 46, RED).ellipse(x, 102, 36, 42, WHITE, line_mm=1.2)
@@ -190,26 +171,10 @@ def mustard_bottle() -> Mesh:
 def bleach_bottle() -> Mesh:
     """Draw a bottle of cleaner, as large as YCB's bleach cleanser, without its handle's hole."""
     rx, ry, neck = 0.0512, 0.03385, 0.0175
-    body: Profile = [
-        (0.94 * rx, 0.92 * ry, 0),
-        (rx, ry, 0.005),
-        (rx, ry, 0.06),
-        (rx, ry, 0.12),
-        (0.97 * rx, 0.98 * ry, 0.15),
-    ]
-    body += [
-        (0.8 * rx, 0.9 * ry, 0.185),
-        (0.52 * rx, 0.7 * ry, 0.205),
-        (neck, neck, 0.213),
-        (neck, neck, 0.220),
-    ]
-    cap: Profile = [
-        (neck, neck, 0.220),
-        (0.0205, 0.0205, 0.2205),
-        (0.0205, 0.0205, 0.246),
-        (0.0185, 0.0185, 0.2506),
-        (0, 0, 0.2506),
-    ]
+    body: Profile = [(0.94 * rx, 0.92 * ry, 0), (rx, ry, 0.005), (rx, ry, 0.06), (rx, ry, 0.12)]
+    body += [(0.97 * rx, 0.98 * ry, 0.15), (0.8 * rx, 0.9 * ry, 0.185)]
+    body += [(0.52 * rx, 0.7 * ry, 0.205), (neck, neck, 0.213), (neck, neck, 0.220)]
+    cap: Profile = [(neck, 0.220), (0.0205, 0.2205), (0.0205, 0.246), (0.0185, 0.2506), (0, 0.2506)]
     page = Canvas(274, 234, WHITE)
     page.fade((90, 84, 184, 226), (24, 96, 190), (10, 40, 120))
     page.burst(137, 148, 44, 30, SKY, 12).ellipse(137, 148, 28, 22, WHITE)

@@ -25,12 +25,9 @@ def _open(outside: Profile, wall: float, floor: float) -> tuple[Profile, Profile
     """
     top = outside[-1][1]
     inside: Profile = [(r - wall, max(z, floor)) for r, z in reversed(outside) if r - wall > 0]
-    rim: Profile = [
-        outside[-1],
-        (outside[-1][0] - 0.3 * wall, top + 0.0008),
-        (outside[-1][0] - 0.7 * wall, top + 0.0008),
-    ]
-    inner: Profile = [*rim, *(p for p in inside if p[1] > floor), (inside[-1][0], floor)]
+    rim: Profile = [(outside[-1][0] - share * wall, top + 0.0008) for share in (0.3, 0.7)]
+    inner: Profile = [outside[-1], *rim, *(p for p in inside if p[1] > floor)]
+    inner += [(inside[-1][0], floor)]
     return inner, [inner[-1], (0.0, floor)]
 
 
@@ -66,14 +63,8 @@ def _handle(
 def mug() -> Mesh:
     """Draw a mug with a handle at +x, as large as YCB's."""
     r, height = 0.04655, 0.0805
-    outside: Profile = [
-        (r - 0.004, 0),
-        (r - 0.001, 0.003),
-        (r, 0.008),
-        (r, 0.04),
-        (r, 0.072),
-        (r, height),
-    ]
+    outside: Profile = [(r - 0.004, 0), (r - 0.001, 0.003), (r, 0.008), (r, 0.04), (r, 0.072)]
+    outside += [(r, height)]
     page = Canvas(292, 84, (176, 30, 36))
     page.ellipse(146, 44, 30, 26, CREAM).text("HELLO", (122, 30, 170, 50), NAVY, 0.17)
     page.text("DAY", (134, 50, 158, 62), ORANGE, 0.17)
@@ -119,15 +110,8 @@ def bowl() -> Mesh:
 def pitcher() -> Mesh:
     """Draw a jug with a spout at -x and a handle at +x, as large as YCB's pitcher base."""
     r, height = 0.0665, 0.2416
-    outside: Profile = [
-        (0.78 * r, 0),
-        (0.8 * r, 0.004),
-        (0.86 * r, 0.06),
-        (0.92 * r, 0.13),
-        (0.97 * r, 0.195),
-        (r, 0.225),
-        (r, height),
-    ]
+    outside: Profile = [(0.78 * r, 0), (0.8 * r, 0.004), (0.86 * r, 0.06), (0.92 * r, 0.13)]
+    outside += [(0.97 * r, 0.195), (r, 0.225), (r, height)]
     page = Canvas(400, 250, BLUE)
     page.fade((0, 0, 400, 250), (60, 120, 210), (24, 66, 158)).rect((0, 0, 400, 12), WHITE)
     for k in range(9):
@@ -138,11 +122,8 @@ def pitcher() -> Mesh:
     floor = Canvas(50, 50, (44, 98, 186))
     body = _vessel(outside, 0.003, 0.006, 40)
     corners = body.corners.copy()
-    toward = (
-        np.clip(-corners[..., 0] / r, 0, 1) ** 6
-        * np.clip((corners[..., 2] - 0.2) / 0.04, 0, 1) ** 2
-    )
-    corners[..., 0] -= 0.0070 * toward  # pull the rim out into a spout
+    ahead, high = np.clip(-corners[..., 0] / r, 0, 1), np.clip((corners[..., 2] - 0.2) / 0.04, 0, 1)
+    corners[..., 0] -= 0.0070 * (ahead**6 * high**2)  # pull the rim out into a spout
     soup = join(
         Soup(corners, body.uv), _handle((0.055, 0.0635), 0.1886 - 0.0735, (0.07, 0.215), 0.0085)
     )
@@ -152,15 +133,8 @@ def pitcher() -> Mesh:
 def marker() -> Mesh:
     """Draw a felt pen lying along x, its cap at +x; as large as YCB's large marker."""
     r, length = 0.0094, 0.121
-    body: Profile = [
-        (0, 0),
-        (0.8 * r, 0),
-        (0.93 * r, 0.002),
-        (0.93 * r, 0.04),
-        (0.93 * r, 0.078),
-        (r, 0.078),
-        (r, 0.100),
-    ]
+    body: Profile = [(0, 0), (0.8 * r, 0), (0.93 * r, 0.002), (0.93 * r, 0.04), (0.93 * r, 0.078)]
+    body += [(r, 0.078), (r, 0.100)]
     body += [(0.9 * r, 0.106), (0.85 * r, 0.1205), (0.8 * r, length), (0, length)]
     page = Canvas(60, 137, WHITE)  # y = 137 mm less the arc length
     page.rect((0, 0, 60, 51), BLACK).rect((0, 126, 60, 137), BLACK).rect((0, 52, 60, 58), RED)
@@ -170,11 +144,8 @@ def marker() -> Mesh:
     plain = Canvas(50, 50, BLACK)
     upright = lathe(body, SIDE, 28)
     lying = np.array([[0, 0, 1.0], [-1.0, 0, 0], [0, -1.0, 0]])  # z to x, front (-y) to above
-    return weld(
-        "marker",
-        transform(upright, lying, np.array([-length / 2, 0, r])),
-        texture(page, plain, plain, plain),
-    )
+    pen = transform(upright, lying, np.array([-length / 2, 0, r]))
+    return weld("marker", pen, texture(page, plain, plain, plain))
 
 
 def banana() -> Mesh:
@@ -198,13 +169,9 @@ def banana() -> Mesh:
     page.rect((0, 0, 120, 5), BROWN).rect((0, 204, 120, 210), (50, 36, 22))
     rng = np.random.default_rng(101)
     for _ in range(70):
-        page.ellipse(
-            rng.uniform(0, 120),
-            rng.uniform(20, 190),
-            rng.uniform(0.3, 1.2),
-            rng.uniform(0.6, 4.5),
-            (176, 128, 44),
-        )
+        x, y = rng.uniform(0, 120), rng.uniform(20, 190)
+        rx, ry = rng.uniform(0.3, 1.2), rng.uniform(0.6, 4.5)
+        page.ellipse(x, y, rx, ry, (176, 128, 44))
     page.ellipse(60, 96, 9, 8, BLUE).text("TROPI", (52, 91, 68, 101), WHITE, 0.14)
     plain = Canvas(50, 50, BROWN)
     return weld("banana", flat, texture(page, plain, plain, plain))
