@@ -17,18 +17,7 @@ _UNITS = (1e-2, 1e7)  # depth image units a meter
 
 
 def check_camera(K: np.ndarray, path: Path) -> None:
-    """Refuse intrinsics that are no pinhole camera's.
-
-    Args:
-        K: Intrinsics (3, 3) [px].
-        path: The file that they are from.
-
-    Raises:
-        BadData: K is not finite, its focal lengths are not positive, or its other elements are not
-            as they must be.
-    """
-    if not np.isfinite(K).all():
-        raise BadData(path, "intrinsics hold NaN or infinity")
+    """Raise BadData for finite intrinsics K (3, 3) [px] of a file that are no pinhole camera's."""
     if flaw := find_matrix_flaw(K):
         raise BadData(path, "intrinsics are no camera matrix", flaw)
 
