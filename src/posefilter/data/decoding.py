@@ -1,14 +1,19 @@
-"""Decode frames at the size of the network, through a cache."""
+"""Decode frames at the size of the network, through a cache, and find out which are fit for use."""
 
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 
 from posefilter.data.cache import FrameCache, Prepared
-from posefilter.data.frames import FrameRecord, Sample
+from posefilter.data.frames import FrameRecord, NotShown, Sample
 from posefilter.data.readers.base import BaseReader
 from posefilter.data.readers.checked import index_records, read_checked
 from posefilter.data.resize import network_size, resize
-from posefilter.errors import BadData
+from posefilter.errors import BadData, UserError
+from posefilter.progress import bars
+
+_CHUNK = 64  # records decoded at a time
 
 
 class FrameDecoder:
@@ -54,3 +59,51 @@ class FrameDecoder:
         sample = read_checked(self._reader, self._index[record.key], record)
         height, width = sample.mask.shape
         return resize(sample, *network_size(height, width, *self._size))
+
+    def find_usable(
+        self,
+        records: Sequence[FrameRecord],
+        min_visibility: float,
+        limit: int | None,
+        on_error: str,
+        threads: int,
+        title: str,
+        progress: bool,
+    ) -> tuple[list[FrameRecord], Counter[str]]:
+        """Return the records that can be used, and how many were left out for which reason.
+
+        Frames whose visibility is unknown pass; `limit` is how many are enough. Raises UserError
+        for the first broken file where `on_error` is "raise". An object that is listed but not in
+        the label is no error: it is left out and counted.
+        """
+        chosen: list[FrameRecord] = []
+        left_out: Counter[str] = Counter()
+        for record, found in self._fetch_all(records, threads, title, progress):
+            if limit is not None and len(chosen) >= limit:
+                break
+            if isinstance(found, BadData):
+                if on_error == "raise" and not isinstance(found, NotShown):
+                    raise UserError(
+                        f"{found}; data.on_error=skip leaves such frames out and counts them"
+                    ) from found
+                left_out[found.cause] += 1
+            elif found.pixels == 0:
+                left_out["the mask vanishes at this image size"] += 1
+            elif found.visibility < min_visibility:
+                left_out[f"visibility below {min_visibility}"] += 1
+            else:
+                chosen.append(record)
+        return chosen, left_out
+
+    def _fetch_all(
+        self, records: Sequence[FrameRecord], threads: int, title: str, progress: bool
+    ) -> Iterator[tuple[FrameRecord, Prepared | BadData]]:
+        """Yield the records in order, each with what is kept of it, or what is wrong with it."""
+        shown = progress and len(records) >= _CHUNK
+        with ThreadPoolExecutor(threads) as pool, bars(shown=shown, transient=True) as bar:
+            task = bar.add_task(title, total=len(records))
+            for at in range(0, len(records), _CHUNK):
+                chunk = records[at : at + _CHUNK]
+                for pair in zip(chunk, pool.map(self.fetch, chunk), strict=True):
+                    bar.advance(task)
+                    yield pair

@@ -19,7 +19,6 @@ from posefilter.data.frames import FrameRecord
 from posefilter.data.generated_scenes import ensure_scenes
 from posefilter.data.loaders import count_batches, make_loader, spare_cores
 from posefilter.data.points import read_model_points
-from posefilter.data.prepare import usable
 from posefilter.data.readers.base import BaseReader
 from posefilter.data.readers.registry import open_meshes, open_reader
 from posefilter.data.splits import NAMES, Share, split_records
@@ -267,9 +266,8 @@ class PoseDataModule(LightningDataModule):
         keep = partial(open_cache, "memory", Path(), "")
         size = (self._image_width, self._image_height)
         decoder = FrameDecoder(reader, records, *size, keep)
-        chosen, _ = usable(
+        chosen, _ = decoder.find_usable(
             [found[i] for i in order],
-            decoder.fetch,
             0.0,
             limit,
             "skip",
@@ -376,9 +374,8 @@ class PoseDataModule(LightningDataModule):
             order = np.random.default_rng([self._split_seed, first]).permutation(len(part))
             part = [part[i] for i in order]
         records = [self._records[i] for i in part]
-        chosen, self._left_out[split] = usable(
+        chosen, self._left_out[split] = self._decoder.find_usable(
             records,
-            self._decoder.fetch,
             self._least[split],
             limit,
             self._on_error,
