@@ -54,8 +54,8 @@ def read_depth(path: Path, units: float, scaled_floats: bool = False) -> np.ndar
     is_array, image = _is_array(path), _read_numbers(path)
     image = image[..., 0] if image.ndim == 3 and image.shape[2] == 1 else image
     image = image[0] if image.ndim == 3 and image.shape[0] == 1 else image
+    found = f"found {image.dtype} {image.shape}"
     if is_array and (image.ndim != 2 or image.dtype.kind not in "fui"):
-        found = f"found {image.dtype} {image.shape}"
         raise BadData(path, "depth is no array (H, W) of numbers", found)
     if image.ndim == 2 and (image.dtype.kind in "fi" or is_array):
         image = np.where(np.isfinite(image), image, 0) if image.dtype.kind == "f" else image
@@ -67,7 +67,6 @@ def read_depth(path: Path, units: float, scaled_floats: bool = False) -> np.ndar
         if image.dtype.kind == "f" and not scaled_floats:
             return image.astype(np.float32)
     elif image.dtype != np.uint16 or image.ndim != 2:
-        found = f"found {image.dtype} {image.shape}"
         raise BadData(path, "depth is not a 16-bit image of one channel", found)
     if not (np.isfinite(units) and units > 0):
         raise BadData(path, "depth scale is not a positive number", f"{units} units a meter")

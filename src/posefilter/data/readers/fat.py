@@ -191,15 +191,13 @@ class FatReader(BaseReader):
             try:
                 if camera not in known:
                     raise BadData(folder / "_camera_settings.json", f"no camera named '{camera}'")
-                color = f"{stem}.jpg"
-                if color not in names and f"{stem}.png" in names:
-                    color = f"{stem}.png"
-                own = (color, f"{stem}.depth.png", f"{stem}.seg.png", f"{stem}.json")
+                only_png = f"{stem}.jpg" not in names and f"{stem}.png" in names
+                endings = ("png" if only_png else "jpg", "depth.png", "seg.png", "json")
+                own = (f"{stem}.{ending}" for ending in endings)
                 shared = ("_camera_settings.json", "_object_settings.json")
                 files = tuple(folder / x for x in (*own, *shared))
-                yield from self._list_frame(
-                    2 * number + (camera == "right"), int(frame), files, classes, known[camera]
-                )
+                scene = 2 * number + (camera == "right")
+                yield from self._list_frame(scene, int(frame), files, classes, known[camera])
             except BadData as error:
                 self._leave_out(error)
 
@@ -223,14 +221,13 @@ class FatReader(BaseReader):
                 )
             if name in self.objects:
                 pose = camera_from_aligned(one, path, where) @ classes[name].aligned_from_mesh
-                visibility = 1.0
-                if "visibility" in one:
-                    visibility = float(numbers(one, "visibility", path, (), where))
+                told = "visibility" in one
+                visibility = float(numbers(one, "visibility", path, (), where)) if told else 1.0
                 found.setdefault(name, []).append((k, pose, visibility))
         entries = []
         # kitchen_0 is one place, whether in `single` or in `mixed`, left or right
         group = path.parent.name
-        scene = path.parent.relative_to(self.root).as_posix() if path.parent != self.root else group
+        scene = group if path.parent == self.root else path.parent.relative_to(self.root).as_posix()
         image = f"{scene}/{path.name.removesuffix('.json')}"
         for name, many in found.items():
             if len(many) > 1 and self._geometry is None:
