@@ -36,7 +36,9 @@ def read_color(path: Path) -> np.ndarray:
 
 
 def read_depth(path: Path, units: float, scaled_floats: bool = False) -> np.ndarray:
-    """Read a depth image, or an array of depths (`.npy`).
+    """Read a depth image, or an array of depths (`.npy`).  -> (H, W) float32 [m], 0 where unknown.
+
+    Unknown are saturated pixels, floats that are NaN or infinite, and what is negative.
 
     Args:
         path: A 16-bit image, or an array (H, W) of whole numbers, in `units`; or an image (TIFF) or
