@@ -22,10 +22,7 @@ from posefilter.meshes.write import write_obj
 
 HOME = Path(__file__).parents[1]
 CLUTTER = ("003_cracker_box", "005_tomato_soup_can", "006_mustard_bottle")
-BESIDE = {
-    "009_gelatin_box": ("008_pudding_box",),
-    "004_sugar_box": ("025_mug",),
-}
+BESIDE = {"009_gelatin_box": ("008_pudding_box",), "004_sugar_box": ("025_mug",)}
 COPIES = {"004_sugar_box": {"large_sugar_box": 1.35, "small_sugar_box": 0.75}}
 SEEDS = {"009_gelatin_box": 4242, "004_sugar_box": 4343}
 SEARCHES = (1, 3)

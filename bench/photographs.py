@@ -148,15 +148,7 @@ def row(run: Run, root: Path, where: str) -> list[str] | None:
     start = _tell_start(words.get("warm_start", ""))
     step = own["training"]["cpu_seconds_per_step"]  # unknown where the test was made by itself
     cost = "" if step is None else f"{own['training']['steps'] * step / 60:.1f}"
-    first = [
-        run.name,
-        run.object,
-        run.model,
-        _tell_augment(run),
-        start,
-        str(run.steps),
-        cost,
-    ]
+    first = [run.name, run.object, run.model, _tell_augment(run), start, str(run.steps), cost]
     return [*first, *_figures(tested)]
 
 

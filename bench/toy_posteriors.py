@@ -30,14 +30,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from exact_posteriors import (
-    CENTER,
-    Posterior,
-    make_gaussian,
-    make_modes,
-    make_ring,
-    normalize,
-)
+from exact_posteriors import CENTER, Posterior, make_gaussian, make_modes, make_ring, normalize
 from torch import Generator, Tensor
 
 from posefilter.belief import Belief

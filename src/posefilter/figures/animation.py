@@ -7,19 +7,8 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 import torch
 
-from posefilter.figures.canvas import (
-    TRUTH,
-    close_up,
-    full_view,
-    stamp_dots,
-)
-from posefilter.figures.layout import (
-    WIDTH,
-    add_caption,
-    center_part,
-    compose_figure,
-    draw_legend,
-)
+from posefilter.figures.canvas import TRUTH, close_up, full_view, stamp_dots
+from posefilter.figures.layout import WIDTH, add_caption, center_part, compose_figure, draw_legend
 from posefilter.figures.panels import arrange_row
 from posefilter.figures.particles import (
     choose_by_weight,

@@ -102,9 +102,7 @@ def draw_belief(
     )
 
 
-def select_single(
-    belief: Belief | BeliefBatch,
-) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+def select_single(belief: Belief | BeliefBatch) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
     """Return the poses (N, 4, 4), weights (N,) that sum to 1, and estimate (4, 4) of a belief about
     one image.
     """

@@ -8,13 +8,7 @@ import torch
 
 from posefilter.figures.canvas import Color, arrange_grid
 from posefilter.figures.curves import choose_ticks
-from posefilter.figures.layout import (
-    CAPTION,
-    DETAIL,
-    add_caption,
-    draw_text,
-    tile_width,
-)
+from posefilter.figures.layout import CAPTION, DETAIL, add_caption, draw_text, tile_width
 from posefilter.figures.panels import Axis, draw_histogram_panel
 from posefilter.geometry.pose import origin_of, rotation_of
 from posefilter.geometry.rotation import log_so3

@@ -5,20 +5,8 @@ import numpy as np
 import torch
 from matplotlib import colormaps
 
-from posefilter.figures.canvas import (
-    TRUTH,
-    View,
-    arrange_grid,
-    close_up,
-    full_view,
-)
-from posefilter.figures.layout import (
-    CAPTION,
-    compose_figure,
-    draw_legend,
-    draw_text,
-    tile_width,
-)
+from posefilter.figures.canvas import TRUTH, View, arrange_grid, close_up, full_view
+from posefilter.figures.layout import CAPTION, compose_figure, draw_legend, draw_text, tile_width
 from posefilter.figures.panels import draw_color_scale
 from posefilter.figures.particles import (
     choose_by_weight,
