@@ -13,7 +13,6 @@ those of another camera. Frames are evenly spaced over each sequence. What is dr
 number of the image alone: all checkpoints of an object see the same images.
 """
 
-import argparse
 import json
 import sys
 from collections.abc import Iterable, Sequence
@@ -26,6 +25,7 @@ from depth_sensors import SENSORS
 from held_out import choose_points, name_weights
 from marked import format_row, put_table, read_rows
 from numpy.random import Generator
+from programs import HOME, make_parser
 
 import posefilter
 from posefilter.data.augmentation import Augment, Compose, Draw, PasteOccluder, RollAndZoom
@@ -37,7 +37,7 @@ from posefilter.memory import keep_freed_memory
 from posefilter.metrics.errors import add, add_s, add_up_to_symmetry
 from posefilter.metrics.scores import auc
 
-PAGE = Path(__file__).parents[1] / "docs" / "results" / "photographs.md"
+PAGE = HOME / "docs" / "results" / "photographs.md"
 VIEWS = 4  # photographs of a sequence that are altered
 SCRAPS = 6  # photographs of other sequences that occluders are cut from
 HEAD = ("object", "weights", "change", "images", "ADD AUC", "ADD-S AUC", "ADD < 0.1 d %")
@@ -157,9 +157,7 @@ def write_table(rows: Sequence[dict[str, Any]], page: Path = PAGE) -> None:
 
 def main() -> int:
     """Test the checkpoints on every kind of change."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = make_parser(__doc__)
     parser.add_argument("checkpoints", nargs="*")
     parser.add_argument("--frames", help="a folder of YCB-Video")
     parser.add_argument("--meshes", help="its meshes")

@@ -8,8 +8,6 @@ wrong size, and of the wrong answers that calibration alone would declare found,
 noticed. Writes the table of docs/results/confidence.md.
 """
 
-import argparse
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -17,6 +15,7 @@ import torch
 from confidence import is_right_pose
 from held_out import read_frames
 from marked import format_row, put_table
+from programs import HOME, make_parser
 
 import posefilter
 from posefilter.confidence.verdicts import decide
@@ -24,7 +23,7 @@ from posefilter.data.frames import Sample
 from posefilter.memory import keep_freed_memory
 from posefilter.weights import list_shipped
 
-PAGE = Path(__file__).parents[1] / "docs" / "results" / "confidence.md"
+PAGE = HOME / "docs" / "results" / "confidence.md"
 FACTORS = (1.0, 1.25, 0.8)
 HEAD = ("object", "images right", "size, median", "flagged")
 HEAD += tuple(
@@ -65,9 +64,7 @@ def tabulate(name: str, answers: list[list[dict[str, Any]]]) -> str:
 
 def main() -> None:
     """Measure, print and write."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = make_parser(__doc__)
     parser.add_argument("--root", required=True, help="a folder of rendered scenes")
     parser.add_argument("--meshes", required=True, help="a folder of YCB's meshes")
     parser.add_argument("--only", nargs="+", default=list(list_shipped()), help="objects")

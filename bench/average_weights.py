@@ -9,12 +9,12 @@ OUT.ckpt is a checkpoint for export.py, as the run's; with `--keep` its recipe a
 those of the file. It has no calibration: other weights need another.
 """
 
-import argparse
 import sys
 from collections.abc import Mapping
 from pathlib import Path
 
 import torch
+from programs import make_parser
 from torch import Tensor
 
 import posefilter
@@ -60,9 +60,7 @@ def average(
 
 def main() -> int:
     """Write the average."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = make_parser(__doc__)
     parser.add_argument("before", help="a file of weights")
     parser.add_argument("after", type=Path, help="a checkpoint of the run that began with it")
     parser.add_argument("out", type=Path)

@@ -8,16 +8,15 @@ torch, against the fastest product, in the type that estimates take, that this m
 do in the same process: how much a batch could win at most. Writes the table of docs/performance.md.
 """
 
-import argparse
 import math
 import time
 from collections.abc import Callable, Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 from marked import format_row, put_table
+from programs import HOME, make_parser
 from torch.utils.flop_counter import FlopCounterMode
 
 import posefilter
@@ -27,7 +26,7 @@ from posefilter.data.sequences import SceneVideo, VideoFrame, list_scenes
 from posefilter.memory import keep_freed_memory
 from posefilter.nets.layers import fast_bfloat16
 
-PAGE = Path(__file__).parents[1] / "docs" / "performance.md"
+PAGE = HOME / "docs" / "performance.md"
 HEAD = (
     "threads", "images in a call", "an image, ms", "CPU ms", "throughput over single images",
     "GFLOP an image", "GFLOP a CPU second", "peak", "share of the peak",
@@ -116,9 +115,7 @@ def measure(
 
 def main() -> None:
     """Measure, print and write."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = make_parser(__doc__)
     parser.add_argument("--frames", required=True, help="a folder of YCB-Video")
     parser.add_argument("--meshes", required=True, help="a folder of YCB's meshes")
     parser.add_argument("--only", default="003_cracker_box", help="the object")

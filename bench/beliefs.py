@@ -11,13 +11,13 @@ images and of those whose visibility is below and above one half.  The density k
 that the checkpoint's object has.
 """
 
-import argparse
 import json
 import sys
 from pathlib import Path
 from typing import Any
 
 import torch
+from programs import HOME, make_parser
 
 from posefilter.cli.build import build_data
 from posefilter.cli.checkpoints import method_of, read_checkpoint
@@ -30,7 +30,6 @@ from posefilter.metrics.credibility import SHOWN, measure_coverage, score_truth
 from posefilter.models.base import PoseEstimator
 from posefilter.types import Batch, BeliefBatch
 
-HOME = Path(__file__).parents[1]
 SPLIT = "data.split={train: 0.8, val: 0.05, test: 0.15}"
 POWERS = (1.0, 0.5, 0.25, 0.1)
 TEMPERATURES = (0.1, 0.25, 0.5, 1.0, 2.0)
@@ -111,9 +110,7 @@ def tabulate(rows: list[dict[str, Any]]) -> str:
 
 def main() -> int:
     """Print the tables."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = make_parser(__doc__)
     parser.add_argument("--weights", nargs="+", required=True)
     parser.add_argument("--root", type=Path, required=True)
     parser.add_argument("--meshes", required=True)

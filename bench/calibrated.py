@@ -25,7 +25,6 @@ whose estimate is right: ellipsoids are of the belief's covariance about the est
 of Student's t.
 """
 
-import argparse
 import json
 import math
 import sys
@@ -39,6 +38,7 @@ import numpy as np
 import torch
 from checkpoint_frames import open_frames
 from confidence import degrees_of, measure_error, read_tolerance
+from programs import make_parser
 from scipy.stats import kstest
 
 from posefilter.belief import Belief
@@ -398,9 +398,7 @@ def tabulate_confidence(rows: Sequence[Row]) -> str:
 
 def main() -> int:
     """Collect rows, print the tables; the status is 3 where --minutes ended it."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = make_parser(__doc__)
     parser.add_argument("files", nargs="*")
     parser.add_argument("--root")
     parser.add_argument("--meshes")

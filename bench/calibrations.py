@@ -10,17 +10,14 @@ frames, its own and those in which it stands in the clutter of others, so that 1
 with an object and 400 without.
 """
 
-import argparse
-import shlex
-import subprocess
 import sys
 import time
 from collections.abc import Sequence
 from pathlib import Path
 
 import photographs
+from programs import HOME, make_parser, run_command
 
-HOME = Path(__file__).parents[1]
 FIRST_SEED = 301  # trainings and tests have seeds below
 
 
@@ -48,9 +45,7 @@ def list_commands(
 
 def main() -> int:
     """Run the commands; the status is that of the worst."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = make_parser(__doc__)
     parser.add_argument("files", nargs="*", type=Path)
     parser.add_argument("--root", type=Path, required=True)
     parser.add_argument("--meshes", type=Path, required=True, help="a folder of YCB's meshes")
@@ -68,12 +63,10 @@ def main() -> int:
         photographs.link_meshes(root, options.meshes)
     without = options.frames if options.without is None else options.without
     for words in list_commands(files, root, options.frames, without, options.each):
-        print(f"$ python {shlex.join(words)}", flush=True)
-        if options.list:
-            continue
         start = time.perf_counter()
-        status = subprocess.run([sys.executable, *words], cwd=HOME, check=False).returncode
-        print(f"{time.perf_counter() - start:.0f} s, status {status}", flush=True)
+        status = run_command(words, options.list)
+        if not options.list:
+            print(f"{time.perf_counter() - start:.0f} s, status {status}", flush=True)
         worst = max(worst, abs(status))
     return worst
 

@@ -3,12 +3,12 @@
 from pathlib import Path
 from typing import Any
 
+from programs import HOME
+
 from posefilter.cli.build import build_data
 from posefilter.cli.command import compose_job
 from posefilter.cli.evaluate import data_settings
 from posefilter.data.module import PoseDataModule
-
-HOME = Path(__file__).parents[1]
 
 
 def open_frames(file: str, checkpoint: dict[str, Any], name: str, options: Any) -> PoseDataModule:

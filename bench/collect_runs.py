@@ -8,21 +8,20 @@ other rows stay, so that a part of a table can be made by itself. `bench/tables.
 tables of the documents.
 """
 
-import argparse
 import csv
 import json
 import re
-import subprocess
 import sys
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
+from programs import HOME, make_parser, run_command
+
 from posefilter.cli.ablations import ABLATIONS
 from posefilter.cli.renamed import rename
 from posefilter.metrics.registry import find_metric, read_number
 
-HOME = Path(__file__).parents[1]
 KEYS = (
     "particles_on_object",
     "diagnostics/on_object/first",
@@ -144,9 +143,7 @@ def make_rows(table: str, runs: Iterable[Run]) -> list[dict[str, str]]:
 
 def main() -> int:
     """Read the runs, replace their rows, and fill the tables of the documents."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = make_parser(__doc__)
     parser.add_argument("folder", nargs="?", type=Path, default=Path("outputs/methods"))
     parser.add_argument("--out", type=Path, default=HOME / "docs" / "results" / "runs.csv")
     options = parser.parse_args()
@@ -167,7 +164,7 @@ def main() -> int:
         writer = csv.DictWriter(file, header, lineterminator="\n")
         writer.writeheader()
         writer.writerows(sorted(rows.values(), key=order))
-    return subprocess.run([sys.executable, "bench/tables.py"], cwd=HOME, check=False).returncode
+    return run_command(["bench/tables.py"])
 
 
 if __name__ == "__main__":

@@ -12,7 +12,6 @@ the median color of the mask. Of a FAT folder that the checkpoint was
 trained on, its own held-out split is taken.
 """
 
-import argparse
 import json
 import sys
 from collections.abc import Callable
@@ -22,6 +21,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from programs import make_parser
 from torch.utils.data import DataLoader, Dataset
 
 from posefilter.cli.checkpoints import method_of, read_checkpoint
@@ -111,9 +111,7 @@ def table(results: dict[str, dict[str, Any]]) -> str:
 
 def main() -> int:
     """Measure, print the table, and write the metrics if asked."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = make_parser(__doc__)
     parser.add_argument("checkpoint")
     parser.add_argument("--source", default="ycb_video", choices=["ycb_video", "fat", "bop"])
     parser.add_argument("--root", required=True, help="the dataset's folder")

@@ -14,10 +14,7 @@ what did not run stay; with `--tiny`, which checks that all pieces run, both are
 own folder.
 """
 
-import argparse
 import json
-import shlex
-import subprocess
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
@@ -26,11 +23,11 @@ from typing import NamedTuple
 import numpy as np
 import torch
 from marked import format_row, put_table, read_rows, split_row
+from programs import HOME, make_parser, run_command
 
 from posefilter.metrics.image_errors import FILE, ImageError, read_errors
 from posefilter.metrics.scores import auc, recall
 
-HOME = Path(__file__).parents[1]
 ROOT, TINY_ROOT = Path("outputs/comparisons"), Path("outputs/comparisons_tiny")
 PAGE = HOME / "docs" / "results" / "comparisons.md"
 POSED = ("dense_coordinates", "rotation_grid", "patch_pf", "pixel_pf", "keypoints", "pose_pf")
@@ -326,15 +323,12 @@ def write_results(tiny: bool) -> int:
         page, rows = HOME / root / PAGE.name, HOME / root / "runs.csv"
         page.write_text(PAGE.read_text())
     write_tables(root, page)
-    collect = [sys.executable, "bench/collect_runs.py", str(root), f"--out={rows}"]
-    return subprocess.run(collect, cwd=HOME, check=False).returncode
+    return run_command(["bench/collect_runs.py", str(root), f"--out={rows}"])
 
 
 def main() -> int:
     """Run the plan; the status is that of the worst command."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = make_parser(__doc__)
     parser.add_argument("more", nargs="*")
     names = [piece.name for piece in PLAN]
     parser.add_argument("--only", action="append", choices=[*names, "tables"])
@@ -352,11 +346,7 @@ def main() -> int:
             f"# {piece.name}: {minutes:.0f} min of processor time, {total:.0f} in all", flush=True
         )
         for line in list_lines(piece, models, options.tiny):
-            words = [*line.split(), *options.more]
-            print(f"$ python {shlex.join(words)}", flush=True)
-            if not options.list:
-                done = subprocess.run([sys.executable, *words], cwd=HOME, check=False)
-                worst = max(worst, done.returncode)
+            worst = max(worst, run_command([*line.split(), *options.more], options.list))
         if not options.list:
             worst = max(worst, write_results(options.tiny))
     if not options.list and options.only == ["tables"]:

@@ -11,7 +11,6 @@ with the objects that a photograph shows, and counts the answers that are declar
 (ADD of 0.1 diameters or more, up to symmetry; or by --tolerance, see `posefilter.PoseTolerance`).
 """
 
-import argparse
 import json
 import math
 import sys
@@ -23,6 +22,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 from marked import format_row
+from programs import make_parser
 from scipy.stats import f as f_distribution
 
 import posefilter
@@ -262,9 +262,7 @@ def tabulate_spoiled(rows: list[dict[str, Any]]) -> str:
 
 def main() -> int:
     """Print a row a line, then the table."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = make_parser(__doc__)
     parser.add_argument("--weights", nargs="+", default=["all"])
     parser.add_argument("--source", default="ycb_video")
     parser.add_argument("--root", type=Path, required=True)

@@ -10,7 +10,6 @@ of one thread; only their ratios are to go by. The image is encoded once, before
 are told apart. Writes the tables of docs/results/cost.md.
 """
 
-import argparse
 import time
 from collections.abc import Sequence
 from pathlib import Path
@@ -20,6 +19,7 @@ import cv2
 import numpy as np
 import torch
 from marked import put_table
+from programs import HOME, make_parser
 
 import posefilter
 from posefilter.cli.checkpoints import build_method, recipe
@@ -29,7 +29,6 @@ from posefilter.memory import keep_freed_memory
 from posefilter.models.base import PoseEstimator
 from posefilter.types import Batch
 
-HOME = Path(__file__).parents[1]
 PAGE = HOME / "docs" / "results" / "cost.md"
 METHODS = ("pose_pf", "patch_pf", "pixel_pf", "cnn_patch", "downsized")
 REPEATS = 5
@@ -161,9 +160,7 @@ def make_head(key: str) -> list[str]:
 
 def main() -> None:
     """Measure and write."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = make_parser(__doc__)
     parser.add_argument("--only", action="append", choices=[*SWEEPS])
     parser.add_argument("--methods", nargs="+", default=METHODS, choices=METHODS)
     parser.add_argument("--max-particles", type=int, default=100_000, help="particles")

@@ -7,13 +7,12 @@ three times: by PyTorch with two seeds, and by examples/onnx/poses.py. The two s
 apart estimates are that differ in their random numbers alone. Times are the processor's.
 """
 
-import argparse
 import sys
 import time
-from pathlib import Path
 
 import numpy as np
 import torch
+from programs import HOME, make_parser
 
 import posefilter
 from posefilter.data.readers.registry import open_meshes, open_reader
@@ -21,15 +20,12 @@ from posefilter.data.sequences import SceneVideo, list_scenes
 from posefilter.metrics.errors import add
 from posefilter.metrics.scores import auc
 
-HOME = Path(__file__).parents[1]
 WAYS = ("torch, seed 0", "torch, seed 1", "ONNX Runtime")
 
 
 def main() -> None:
     """Measure, and print a table."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = make_parser(__doc__)
     parser.add_argument("folder")
     parser.add_argument("--checkpoint", default="003_cracker_box")
     parser.add_argument("--frames", required=True)

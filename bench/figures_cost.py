@@ -7,7 +7,6 @@ put off where it would take more than its share). Computing time tells the same 
 keep the machine busy. Without a checkpoint the method is new, which takes as long.
 """
 
-import argparse
 import tempfile
 import time
 from pathlib import Path
@@ -16,6 +15,7 @@ from typing import Any
 import torch
 from lightning import Callback, LightningModule, Trainer
 from lightning.pytorch.loggers import TensorBoardLogger
+from programs import HOME, make_parser
 
 from posefilter.callbacks.tensorboard import Budget
 from posefilter.cli.checkpoints import build_method, method_of, read_checkpoint, recipe
@@ -23,7 +23,6 @@ from posefilter.cli.command import compose_job
 from posefilter.cli.instantiate import instantiate
 from posefilter.cli.machine import settle
 
-HOME = Path(__file__).parents[1]
 LOOKING = ("layout", "speed", "diagnostics", "health", "figures")
 
 
@@ -69,9 +68,7 @@ def looking(job: Any, folder: str) -> list[Callback]:
 
 def main() -> None:
     """Measure and print."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = make_parser(__doc__)
     parser.add_argument("--checkpoint", default=None)
     parser.add_argument("--repeats", type=int, default=5)
     known, settings = parser.parse_known_args()

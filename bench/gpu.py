@@ -12,7 +12,6 @@ batch of 8, and the paper's filter of 1,000 particles, 100 steps and 256 image p
 this project's likelihood and with the paper's own network. Medians, each call waited for.
 """
 
-import argparse
 import json
 import statistics
 import time
@@ -24,6 +23,7 @@ import torch
 from batches import stack
 from held_out import bootstrap, read_frames
 from marked import format_row, put_table
+from programs import HOME, make_parser
 
 import posefilter
 from posefilter.cli.machine import device_name, versions
@@ -37,7 +37,7 @@ from posefilter.nets import fused
 from posefilter.nets.likelihood import sample_points
 from posefilter.types import Batch
 
-PAGE = Path(__file__).parents[1] / "docs" / "performance.md"
+PAGE = HOME / "docs" / "performance.md"
 HEADS = {
     "gpu scores": ("computed", "noise level mm", "largest difference", "mean difference"),
     "gpu estimates": (
@@ -226,9 +226,7 @@ def show(title: str, rows: Iterable[Sequence[str]]) -> None:
 
 def main() -> None:
     """Measure, print and write; or put what was written into the page."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = make_parser(__doc__)
     parser.add_argument("--table", type=Path, help="rows that were written before")
     parser.add_argument("--root", help="held-out renders in the format of Falling Things")
     parser.add_argument("--meshes", help="a folder of YCB's meshes")

@@ -7,7 +7,6 @@ Each row is a method at an ablation; each figure the norm of
 its network's gradient on the first batch of `experiment=memorize`, in units of one step's.
 """
 
-import argparse
 import math
 import sys
 import tempfile
@@ -15,6 +14,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import torch
+from programs import HOME, make_parser
 
 from posefilter.cli.ablations import ABLATIONS
 from posefilter.cli.build import build_data, quiet
@@ -22,7 +22,6 @@ from posefilter.cli.checkpoints import build_method, recipe
 from posefilter.cli.command import compose_job
 from posefilter.cli.machine import settle
 
-HOME = Path(__file__).parents[1]
 DESCRIPTIONS = {row.name: f"`{row.name}` {row.description}" for row in ABLATIONS}
 STEPS = (1, 2, 4, 8, 16, 30)
 SIZES = {"cnn_patch": "filter.particles=32", "patch_pf": "preset/size=patch_pf"}
@@ -90,9 +89,7 @@ def written(number: float) -> str:
 
 def main() -> int:
     """Measure, and print the table."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = make_parser(__doc__)
     parser.add_argument("more", nargs="*")
     parser.add_argument("--only", action="append", choices=SHOWN)
     options = parser.parse_args()

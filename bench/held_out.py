@@ -15,7 +15,6 @@ ADD-S of few surface points is lower than of many. Files carry 200 or 2,000 of t
 object are judged by those of the one that carries the most.
 """
 
-import argparse
 import csv
 import json
 import sys
@@ -26,6 +25,7 @@ from typing import Any
 import numpy as np
 import torch
 from marked import format_row
+from programs import HOME, make_parser
 
 import posefilter
 from posefilter.data.frames import FrameRecord, NotShown, Sample
@@ -35,7 +35,6 @@ from posefilter.memory import keep_freed_memory
 from posefilter.metrics.errors import add, add_s
 from posefilter.metrics.scores import auc
 
-HOME = Path(__file__).parents[1]
 ROWS = HOME / "docs" / "results" / "held_out.csv"
 SPLIT = {"train": 0.8, "val": 0.05, "test": 0.15}
 LEAST = 0.3  # visible share
@@ -200,9 +199,7 @@ def write_rows(rows: Sequence[dict[str, Any]], path: Path = ROWS) -> None:
 
 def main() -> int:
     """Test the checkpoints, or write their rows down."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = make_parser(__doc__)
     parser.add_argument("checkpoints", nargs="*")
     parser.add_argument("--root", help="a dataset of bench/photographs.py, in FAT's format")
     parser.add_argument("--meshes", help="its meshes")

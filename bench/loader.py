@@ -6,13 +6,13 @@ and `Speed` says which share of the time it waited. Epochs are short here, so th
 cost is in the share. Without settings: the default method on 400 rendered frames.
 """
 
-import argparse
 import tempfile
 import time
 from pathlib import Path
 
 import torch
 from omegaconf import OmegaConf
+from programs import HOME, make_parser
 
 from posefilter.callbacks.speed import Speed
 from posefilter.cli.build import build_data, make_trainer, quiet
@@ -22,7 +22,6 @@ from posefilter.cli.instantiate import instantiate
 from posefilter.cli.job import Job
 from posefilter.cli.machine import settle
 
-HOME = Path(__file__).parents[1]
 FEW = ["data.generate.frames=400"]
 
 
@@ -47,9 +46,7 @@ def measure(job: Job, cache: str, workers: int, steps: int) -> tuple[float, floa
 
 def main() -> None:
     """Print a table: cache, processes, set-up, speed, share of the time spent waiting."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = make_parser(__doc__)
     parser.add_argument("--steps", type=int, default=60)
     parser.add_argument("--workers", default="0,1,2")
     known, settings = parser.parse_known_args()

@@ -12,18 +12,16 @@ done and resumes the one that was cut short. What is typed beyond the options, s
 handed to every command.
 """
 
-import argparse
 import math
-import shlex
-import subprocess
 import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
+from programs import make_parser, run_command
+
 from posefilter.cli.ablations import list_pose_space_ablations
 
-HOME = Path(__file__).parents[1]
 FOUR = "model=downsized,cnn_patch,pixel_pf,patch_pf"
 WITH_POSE, DETECTORS = ("patch_pf", "pixel_pf"), ("cnn_patch", "downsized")
 MODELS = (*DETECTORS, *WITH_POSE)
@@ -441,9 +439,7 @@ def waits(line: Line, root: Path) -> bool:
 
 def main() -> int:
     """Run the plan; the status is that of the worst line."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = make_parser(__doc__)
     parser.add_argument("more", nargs="*")
     parser.add_argument(
         "--only", action="append", choices=sorted({line.table for line in plan("DIR", "DIR")})
@@ -459,16 +455,10 @@ def main() -> int:
     for line in plan(options.meshes, options.frames):
         if options.only and line.table not in options.only:
             continue
-        words = command(line, options.root, options.more)
-        print(f"$ python {shlex.join(words)}", flush=True)
-        if options.list or waits(line, options.root):
-            continue
-        worst = max(
-            worst, subprocess.run([sys.executable, *words], cwd=HOME, check=False).returncode
-        )
-        subprocess.run(
-            [sys.executable, "bench/collect_runs.py", str(options.root)], cwd=HOME, check=False
-        )
+        skip = options.list or waits(line, options.root)
+        worst = max(worst, run_command(command(line, options.root, options.more), skip))
+        if not skip:
+            run_command(["bench/collect_runs.py", str(options.root)])
     return worst
 
 

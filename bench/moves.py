@@ -8,7 +8,6 @@ Every way runs on each frame in turn, so that the times of one run compare; each
 of the minutes.  The first frame of each file is not counted: it warms up.
 """
 
-import argparse
 import json
 import sys
 import time
@@ -18,6 +17,7 @@ from typing import Any
 import numpy as np
 import torch
 from checkpoint_frames import open_frames
+from programs import HOME, make_parser
 
 from posefilter.cli.checkpoints import method_of, read_checkpoint
 from posefilter.cli.command import compose_job
@@ -27,7 +27,6 @@ from posefilter.data.loaders import make_loader
 from posefilter.metrics.credibility import SHOWN, measure_coverage, score_truth
 from posefilter.types import Batch
 
-HOME = Path(__file__).parents[1]
 MOVES = "filter/refine=mean_shift_and_resample_move"
 WAYS = {"default": [], "moves": [MOVES], "islands, moves": ["filter/resample=islands", MOVES]}
 HEAD = ["way", "frames", "seconds, median", "over the default", "coverage of credible sets"]
@@ -78,9 +77,7 @@ def tabulate(rows: list[dict[str, Any]]) -> str:
 
 def main() -> int:
     """Print the table."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = make_parser(__doc__)
     parser.add_argument("files", nargs="+")
     parser.add_argument("--root", required=True)
     parser.add_argument("--meshes", required=True)

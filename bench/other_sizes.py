@@ -8,7 +8,6 @@ once, with few kinds of clutter, so that another size is in about half of the im
 one search and with all (`filter.max_searches`); one thread.
 """
 
-import argparse
 import json
 import subprocess
 import sys
@@ -16,11 +15,11 @@ from dataclasses import replace
 from pathlib import Path
 
 from photographs import link_meshes
+from programs import HOME, make_parser
 
 from posefilter.meshes.store import MeshStore
 from posefilter.meshes.write import write_obj
 
-HOME = Path(__file__).parents[1]
 CLUTTER = ("003_cracker_box", "005_tomato_soup_can", "006_mustard_bottle")
 BESIDE = {"009_gelatin_box": ("008_pudding_box",), "004_sugar_box": ("025_mug",)}
 COPIES = {"004_sugar_box": {"large_sugar_box": 1.35, "small_sugar_box": 0.75}}
@@ -57,9 +56,7 @@ def test_command(root: Path, name: str, searches: int) -> list[str]:
 
 def main() -> int:
     """Render and test what is missing, and print a row for each."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = make_parser(__doc__)
     parser.add_argument("--meshes", type=Path, required=True, help="a folder of YCB's meshes")
     parser.add_argument("--root", type=Path, default=Path("outputs/other_sizes"))
     parser.add_argument("--frames", type=int, default=80, help="of each object")

@@ -30,11 +30,11 @@ import roofline
 import torch
 from marked import put_table
 from peer_process import Peer, PeerError
+from programs import HOME, make_parser
 
 from posefilter.data.readers.registry import open_meshes
 from posefilter.memory import keep_freed_memory
 
-HOME = Path(__file__).parents[1]
 PAGE = HOME / "docs" / "results" / "peers.md"
 PHOTOGRAPHED = (
     "002_master_chef_can",
@@ -185,9 +185,7 @@ RUNS = {
 
 def main() -> int:
     """Measure what is asked for, print it, and write it into the page."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = make_parser(__doc__)
     parser.add_argument("what", choices=[*RUNS])
     for name in PROGRAMS:
         parser.add_argument(f"--python-{name}", help=f"the interpreter that has {name}")

@@ -11,11 +11,8 @@ metrics.json is not run again. What is typed beyond the options, such as threads
 every training.
 """
 
-import argparse
 import csv
 import json
-import shlex
-import subprocess
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -35,8 +32,8 @@ from photograph_runs import (
     Run,
     plan,
 )
+from programs import HOME, make_parser, run_command
 
-HOME = Path(__file__).parents[1]
 RUNS = HOME / "docs" / "results" / "photograph_runs.csv"
 HEAD = ["tested on", "run", "object", "method", "augment", "warm start", "steps", "CPU min"]
 HEAD += ["images", "ADD AUC", "ADD-S AUC", "ADD < 0.1 d %", "ADD-S < 0.1 d %", "median mm"]
@@ -206,9 +203,7 @@ def write_runs(root: Path, path: Path = RUNS) -> None:
 
 def main() -> int:
     """Run the plan; the status is that of the worst command."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = make_parser(__doc__)
     parser.add_argument("more", nargs="*")
     parser.add_argument("--meshes", type=Path, help="a folder of YCB's meshes")
     parser.add_argument("--frames", help="a folder of YCB-Video")
@@ -234,12 +229,8 @@ def main() -> int:
         commands += [(words, Path(words[-1].removeprefix("out="))) for words in tests]
     worst = 0
     for words, done in commands:
-        print(f"$ python {shlex.join(words)}", flush=True)
-        if options.list or (done is not None and (done / "metrics.json").is_file()):
-            continue
-        worst = max(
-            worst, subprocess.run([sys.executable, *words], cwd=HOME, check=False).returncode
-        )
+        skip = options.list or (done is not None and (done / "metrics.json").is_file())
+        worst = max(worst, run_command(words, skip))
     if not options.list:
         write_runs(options.root)
     return worst

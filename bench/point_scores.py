@@ -7,11 +7,11 @@ rays. On images of its own test split, points are drawn as in its training, and 
 true pose. The paper shows one point on the surface, at +95.77, and one off it, at -115.43.
 """
 
-import argparse
 import sys
 
 import torch
 from omegaconf import OmegaConf
+from programs import make_parser
 from torch import Tensor
 
 from posefilter.cli.build import build_data, quiet
@@ -55,9 +55,7 @@ def format_table(scores: dict[str, Tensor]) -> str:
 
 def main() -> int:
     """Score the points, and print the table."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = make_parser(__doc__)
     parser.add_argument("checkpoint")
     parser.add_argument("--images", type=int, default=50)
     parser.add_argument("--seed", type=int, default=0)

@@ -6,8 +6,9 @@ The points are drawn uniformly, by seed 0, as training draws them. They are what
 the measured depth (`filters/icp.py`) lays on it, and what ADD is of; no network is changed.
 """
 
-import argparse
 from pathlib import Path
+
+from programs import make_parser
 
 from posefilter.cli.checkpoints import read_checkpoint
 from posefilter.cli.files import pack_whole
@@ -30,9 +31,7 @@ def give_points(file: Path, meshes: str, count: int) -> int:
 
 def main() -> None:
     """Write each file, and say so."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = make_parser(__doc__)
     parser.add_argument("files", nargs="+", type=Path)
     parser.add_argument("--meshes", required=True, help="a folder of YCB's meshes")
     parser.add_argument("--count", type=int, default=2000)

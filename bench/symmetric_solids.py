@@ -12,7 +12,6 @@ the lightest equivalent pose's share of the belief within 10 degrees, over what 
 are 12 rotations that no symmetry relates.
 """
 
-import argparse
 import itertools
 import math
 import sys
@@ -20,6 +19,7 @@ import sys
 import numpy as np
 import torch
 from exact_posteriors import CENTER, Posterior, make_middle
+from programs import make_parser
 from torch import Generator, Tensor
 from toy_posteriors import WAYS, run
 
@@ -116,9 +116,7 @@ def match(poses: Tensor, truths: Tensor) -> Tensor:
 def main() -> int:
     """Print the table."""
     solids = list_solids()
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = make_parser(__doc__)
     parser.add_argument("--particles", type=int, default=1000)
     parser.add_argument("--runs", type=int, default=5)
     parser.add_argument("--only", nargs="+", choices=solids, default=list(solids))

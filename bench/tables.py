@@ -17,20 +17,18 @@ and one without runs, unless bench/methods.py plans it: then the page says that 
 `--check` writes nothing, and fails where a page is not up to date.
 """
 
-import argparse
 import csv
 import re
 import sys
 from collections import defaultdict
 from collections.abc import Iterable
 from fnmatch import fnmatch
-from pathlib import Path
 from statistics import mean, stdev
 
 from methods import plan
+from programs import HOME, make_parser
 from scipy.stats import t as student_t
 
-HOME = Path(__file__).parents[1]
 RUNS = HOME / "docs" / "results" / "runs.csv"
 MOST_ROWS = 10
 PLANNED = {line.table for line in plan("DIR", "DIR")}
@@ -147,9 +145,7 @@ def fill_page(text: str, rows: list[Row]) -> str:
 
 def main() -> int:
     """Fill the tables of every page; with --check, tell whether they are up to date."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = make_parser(__doc__)
     parser.add_argument("--check", action="store_true")
     check = parser.parse_args().check
     with RUNS.open() as file:

@@ -8,11 +8,11 @@ more textured points.  No network is changed. A calibration is of the filter bef
 out: calibrate the files again.  Without --out the files themselves are changed.
 """
 
-import argparse
 from pathlib import Path
 from typing import Any
 
 from omegaconf import OmegaConf
+from programs import HOME, make_parser
 
 from posefilter.cli.checkpoints import read_checkpoint
 from posefilter.cli.files import pack_whole
@@ -25,7 +25,7 @@ TURNS, ALIGNMENT = (
     f"posefilter.filters.{name}"
     for name in ("texture.TextureRotations", "texture_alignment.TextureAlignment")
 )
-REFINE = Path(__file__).parents[1] / "conf/filter/refine"
+REFINE = HOME / "conf/filter/refine"
 
 
 def insert(components: list[dict[str, Any]], choice: str) -> list[dict[str, Any]]:
@@ -58,9 +58,7 @@ def give_texture(file: Path, meshes: str, align: bool, points: int, out: Path) -
 
 def main() -> None:
     """Write each file, and say so."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = make_parser(__doc__)
     parser.add_argument("files", nargs="+", type=Path)
     parser.add_argument("--meshes", required=True, help="a folder of YCB's meshes")
     parser.add_argument("--align", action="store_true", help="lay the estimate on the print, too")

@@ -9,20 +9,18 @@ typed beyond the options, such as threads=1, is handed to every training. Last, 
 docs/data_meshes.md is written.
 """
 
-import argparse
 import json
-import shlex
-import subprocess
 import sys
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from marked import format_row, put_table
+from photographs import link_meshes
+from programs import HOME, make_parser, run_command
 
 from posefilter.meshes.store import MeshStore
 
-HOME = Path(__file__).parents[1]
 ROOT = Path("outputs/tools")
 PAGE = HOME / "docs" / "data_meshes.md"
 TOOLS = ("048_hammer", "051_large_clamp", "043_phillips_screwdriver")
@@ -71,16 +69,6 @@ def train_command(run: Run, more: Sequence[str]) -> list[str]:
     return ["train.py", *words, *more]
 
 
-def link_meshes(meshes: Path) -> None:
-    """Make a folder of links to the tools: no other object is in the scenes."""
-    folder = HOME / ROOT / "meshes"
-    folder.mkdir(parents=True, exist_ok=True)
-    for name in (*TOOLS, *CLUTTER):
-        link = folder / name
-        if not link.is_symlink():
-            link.symlink_to((meshes / name).resolve())
-
-
 def tabulate(run: Run, metrics: dict[str, Any]) -> list[str]:
     """Return a run's rows of the table, one a part; its own figures stand in the first."""
     tool, _, part = run.object.partition(".")
@@ -112,9 +100,7 @@ def read_rows(runs: Sequence[Run]) -> Iterator[str]:
 
 def main() -> int:
     """Run the plan; the status is that of the worst command."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = make_parser(__doc__)
     parser.add_argument("more", nargs="*")
     parser.add_argument("--meshes", type=Path, required=True)
     parser.add_argument("--only", choices=TOOLS, help="one tool")
@@ -131,12 +117,10 @@ def main() -> int:
         todo = [run for run in runs[tool] if not (HOME / run.folder / "metrics.json").is_file()]
         lines += [train_command(run, options.more) for run in todo]
     worst = 0
+    if lines and not options.list:
+        link_meshes(HOME / ROOT, options.meshes, (*TOOLS, *CLUTTER))
     for words in lines:
-        print(f"$ python {shlex.join(words)}", flush=True)
-        if not options.list:
-            link_meshes(options.meshes)
-            done = subprocess.run([sys.executable, *words], cwd=HOME, check=False)
-            worst = max(worst, done.returncode)
+        worst = max(worst, run_command(words, options.list))
     if not options.list:
         rows = [row for tool in TOOLS for row in read_rows(runs[tool])]
         PAGE.write_text(put_table(PAGE.read_text(), "tools", HEAD, rows))

@@ -22,7 +22,6 @@ error over runs (of the Gaussian alone, the others having none that is defined);
 the truths in the 50 and 90 % credible sets, and the evaluations of the likelihood a particle.
 """
 
-import argparse
 import sys
 from collections.abc import Callable
 from functools import partial
@@ -31,6 +30,7 @@ from typing import Any
 import numpy as np
 import torch
 from exact_posteriors import CENTER, Posterior, make_gaussian, make_modes, make_ring, normalize
+from programs import make_parser
 from torch import Generator, Tensor
 
 from posefilter.belief import Belief
@@ -187,9 +187,7 @@ def measure(name: str, options: Any, way: str) -> list[str]:
 
 def main() -> int:
     """Print the table."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = make_parser(__doc__)
     parser.add_argument("--particles", type=int, default=1000)
     parser.add_argument("--runs", type=int, default=5)
     parser.add_argument(

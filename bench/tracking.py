@@ -36,6 +36,7 @@ import numpy as np
 import torch
 from confidence import degrees_of, is_right_pose, measure_error, summarize_errors
 from marked import put_table, read_rows
+from programs import HOME, make_parser
 
 import posefilter
 from posefilter.data.readers.registry import open_meshes, open_reader
@@ -49,7 +50,6 @@ from posefilter.metrics.tracks import measure_jitter
 from posefilter.tracking.motion import ConstantVelocity
 from posefilter.weights import list_shipped
 
-HOME = Path(__file__).parents[1]
 PAGE = HOME / "docs" / "results" / "tracking.md"
 AWAY = range(7, 13)  # frames that are replaced
 SINGLE_SEEDS = 4
@@ -480,9 +480,7 @@ def write_table(name: str, head: Sequence[str], lines: Sequence[str], keys: int)
 
 def main() -> None:
     """Measure, print and write."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = make_parser(__doc__)
     parser.add_argument("--frames", help="a folder of YCB-Video")
     parser.add_argument("--sequences", nargs="+", help="folders that generate.py wrote, =OBJECT")
     parser.add_argument("--seeds", type=int, default=16, help="of tracks; --together has one")

@@ -64,9 +64,7 @@ def test_a_run_replaces_its_own_row_and_no_other(
     write_run(tmp_path / "runs" / "memorize" / "a", 0.9, "model=patch_pf", "variant=working")
     write_run(tmp_path / "runs" / "other" / "deep" / "b", 0.1, "model=patch_pf", "variant=paper")
     into = tmp_path / "runs.csv"
-    monkeypatch.setattr(
-        collect.subprocess, "run", lambda *_, **__: type("Done", (), {"returncode": 0})
-    )
+    monkeypatch.setattr(collect, "run_command", lambda words: 0)
     monkeypatch.setattr(sys, "argv", ["collect_runs", str(tmp_path / "runs"), "--out", str(into)])
     assert collect.main() == 0
     (tmp_path / "runs" / "memorize" / "a" / "metrics.json").unlink()

@@ -6,6 +6,7 @@ import importlib.util
 import itertools
 import os
 import re
+import sys
 from pathlib import Path
 
 import pytest
@@ -14,6 +15,7 @@ from posefilter.cli.command import compose_job
 
 HOME = Path(__file__).parents[2]
 NOT_SHOWN = {"held_out_less", "paper_longer", "patch"}  # single runs, in runs.csv alone
+sys.path.insert(0, str(HOME / "bench"))  # scripts import their neighbors
 spec = importlib.util.spec_from_file_location("methods", HOME / "bench" / "methods.py")
 assert spec is not None
 assert spec.loader is not None
