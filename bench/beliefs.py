@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from marked import format_table
 from programs import HOME, make_parser
 
 from posefilter.cli.build import build_data
@@ -94,7 +95,7 @@ def collect(name: str, options: Any) -> list[dict[str, Any]]:
 
 def tabulate(rows: list[dict[str, Any]]) -> str:
     """Return the numbers of some images as a Markdown table, a row a variant."""
-    lines = [f"| {' | '.join(HEAD)} |", f"|{'---|' * len(HEAD)}"]
+    lines = []
     for variant in dict.fromkeys(row["variant"] for row in rows):
         own = [row for row in rows if row["variant"] == variant]
         rank, density, ess = (
@@ -104,8 +105,8 @@ def tabulate(rows: list[dict[str, Any]]) -> str:
         cells = [variant, str(len(own))]
         cells += [f"{100 * measure_coverage(rank, level / 100):.0f}" for level in SHOWN]
         cells += [f"{density.mean():.2f}", f"{density.median():.2f}", f"{ess.mean():.0f}"]
-        lines.append(f"| {' | '.join(cells)} |")
-    return "\n".join(lines)
+        lines.append(cells)
+    return format_table(HEAD, lines)
 
 
 def main() -> int:

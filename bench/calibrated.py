@@ -38,6 +38,7 @@ import numpy as np
 import torch
 from checkpoint_frames import open_frames
 from confidence import degrees_of, measure_error, read_tolerance
+from marked import format_table
 from programs import make_parser
 from scipy.stats import kstest
 
@@ -287,12 +288,6 @@ def gather_frames(rows: Sequence[Row], leave_out: Sequence[str]) -> Frames:
     return Frames(names, values, there, right, nonconformity, errors)
 
 
-def draw_table(head: Sequence[str], rows: Sequence[Sequence[Any]]) -> str:
-    """Return a Markdown table."""
-    lines = [head, ["---"] * len(head), *rows]
-    return "\n".join(f"| {' | '.join(map(str, line))} |" for line in lines)
-
-
 def share(hits: Sequence[Any]) -> str:
     """Return the percentages of columns of hits, such as `48 / 81`."""
     return " / ".join(f"{100 * x:.0f}" for x in np.atleast_1d(np.mean(hits, axis=0)))
@@ -309,7 +304,7 @@ def tabulate_coverage(rows: Sequence[Row]) -> str:
     """Return coverage by object, by visibility and by what is shown."""
     head = ("frames of", "frames", f"conformal sets of {LEVELS} %", "credible sets", "in the band")
     own = [row for row in rows if row["there"]]
-    return draw_table(head, [[name, *cover(some)] for name, some in divide(own)])
+    return format_table(head, [[name, *cover(some)] for name, some in divide(own)])
 
 
 def divide(rows: Sequence[Row]) -> Iterator[tuple[str, list[Row]]]:
@@ -353,7 +348,7 @@ def tabulate_beliefs(rows: Sequence[Row]) -> str:
         "which is in the median",
         "in the band",
     ]
-    return draw_table([*head, "log density", "levels uniform: p"], lines)
+    return format_table([*head, "log density", "levels uniform: p"], lines)
 
 
 def tell_presence(rows: Sequence[Row], min_shown: float) -> str:
@@ -393,7 +388,7 @@ def tabulate_confidence(rows: Sequence[Row]) -> str:
     head += ["found where absent", "absent where there"]
     names = dict.fromkeys(row["object"] for row in rows)
     lines = [[n, *tell_confidence([row for row in rows if row["object"] == n])] for n in names]
-    return draw_table(head, [*lines, ["all", *tell_confidence(rows)]])
+    return format_table(head, [*lines, ["all", *tell_confidence(rows)]])
 
 
 def main() -> int:

@@ -21,7 +21,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from marked import format_row
+from marked import format_table
 from programs import make_parser
 from scipy.stats import f as f_distribution
 
@@ -212,7 +212,7 @@ def look(
 
 def tabulate(rows: list[dict[str, Any]]) -> str:
     """Return the counts as a Markdown table."""
-    lines = [f"| {' | '.join(HEAD)} |", f"|{'---|' * len(HEAD)}"]
+    lines = []
     for name in dict.fromkeys(row["object"] for row in rows):
         own = [row for row in rows if row["object"] == name and row["there"]]
         other = [row for row in rows if row["object"] == name and not row["there"]]
@@ -222,15 +222,15 @@ def tabulate(rows: list[dict[str, Any]]) -> str:
         cells = [name, len(own), right, len(found), sum(row["right"] for row in found), lost]
         cells += [len(other), *(sum(r["verdict"] == v for r in other) for v in ("found", "unsure"))]
         cells.append(f"{max((row['probability'] for row in other), default=0):.2f}")
-        lines.append(f"| {' | '.join(map(str, cells))} |")
-    return "\n".join(lines)
+        lines.append(cells)
+    return format_table(HEAD, lines)
 
 
 def tabulate_errors(rows: list[dict[str, Any]]) -> str:
     """Return what beliefs say of right estimates, and how far these are off, as a table."""
     head = ("object", "right", "off, median", "said at 95 %, median", "within the translation")
-    lines = [format_row((*head, "the rotation", "ellipsoids of 50 and 95 %"))]
-    lines.append(format_row("---" for _ in range(len(head) + 2)))
+    head += ("the rotation", "ellipsoids of 50 and 95 %")
+    lines = []
     own = [row for row in rows if row.get("right") and "off" in row]
     for name in [*dict.fromkeys(row["object"] for row in own), "all"] if own else []:
         some = [row for row in own if name in (row["object"], "all")]
@@ -238,14 +238,13 @@ def tabulate_errors(rows: list[dict[str, Any]]) -> str:
         words = [f"{shift:.1f} mm, {turn:.1f} degrees" for shift, turn in (found.off, found.says)]
         within = np.sum([row["within"] for row in some], axis=0)
         inside = [sum(row["level"] < level for row in some) for level in (0.5, 0.95)]
-        cells = [name, len(some), *words, *within, " and ".join(map(str, inside))]
-        lines.append(format_row(map(str, cells)))
-    return "\n".join(lines)
+        lines.append([name, len(some), *words, *within, " and ".join(map(str, inside))])
+    return format_table(head, lines)
 
 
 def tabulate_spoiled(rows: list[dict[str, Any]]) -> str:
     """Return the counts of each way to spoil as a Markdown table, of objects that are there."""
-    lines = [format_row(HEAD_SPOILED), format_row("---" for _ in HEAD_SPOILED)]
+    lines = []
     for name in SPOILED:
         own = [row for row in rows if row["input"] == name and row["there"]]
         found = [row for row in own if row["verdict"] == "found"]
@@ -256,8 +255,8 @@ def tabulate_spoiled(rows: list[dict[str, Any]]) -> str:
         cells = [name, len(own), refused, right, len(found), wrong_found]
         cells.append(f"{max((row['probability'] for row in wrong), default=0):.2f}")
         cells.append(sum(row.get("wrong_size", False) for row in own))
-        lines.append(format_row(map(str, cells)))
-    return "\n".join(lines)
+        lines.append(cells)
+    return format_table(HEAD_SPOILED, lines)
 
 
 def main() -> int:

@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 import cv2
 import numpy as np
 import torch
-from marked import put_table
+from marked import format_row, put_table
 from programs import HOME, make_parser
 
 import posefilter
@@ -132,7 +132,7 @@ def describe(name: str, key: str, values: Sequence[int], costs: Sequence[Sequenc
         cells += [show_milliseconds(value) for value in (encode[0], encode[-1])]
         # maps that are not learned, and copies of the image, are of no cost to speak of
         cells.append(f"{fit_exponent(values, encode):.2f}")
-    return f"| {' | '.join(cells)} |"
+    return format_row(cells)
 
 
 def show_milliseconds(seconds: float) -> str:

@@ -1,13 +1,20 @@
-"""Tables of a page in docs/, between the marks `<!-- table: TITLE -->` and `<!-- end -->`."""
+"""Markdown's tables, and those of a page in docs/, between the marks `<!-- table: TITLE -->` and
+`<!-- end -->`.
+"""
 
 from collections.abc import Iterable, Sequence
 
 MARK, END = "<!-- table: {} -->", "<!-- end -->"
 
 
-def format_row(cells: Iterable[str]) -> str:
+def format_row(cells: Iterable[object]) -> str:
     """Return a line of a table."""
-    return f"| {' | '.join(cells)} |"
+    return f"| {' | '.join(map(str, cells))} |"
+
+
+def format_table(head: Sequence[object], rows: Iterable[Iterable[object]]) -> str:
+    """Return a table of cells."""
+    return "\n".join(map(format_row, [head, ["---"] * len(head), *rows]))
 
 
 def split_row(row: str) -> list[str]:
@@ -38,8 +45,7 @@ def put_table(page: str, title: str, head: Sequence[str], rows: Iterable[str]) -
         ValueError: The page has no such marks.
     """
     before, _, after = _split(page, title)
-    table = [format_row(head), format_row(["---"] * len(head)), *rows]
-    return before + "\n".join([MARK.format(title), *table, END]) + after
+    return before + "\n".join([MARK.format(title), format_table(head, ()), *rows, END]) + after
 
 
 def _split(page: str, title: str) -> tuple[str, str, str]:

@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 import torch
 from checkpoint_frames import open_frames
+from marked import format_table
 from programs import HOME, make_parser
 
 from posefilter.cli.checkpoints import method_of, read_checkpoint
@@ -62,7 +63,7 @@ def measure(file: str, options: Any, end: float) -> list[dict[str, Any]]:
 def tabulate(rows: list[dict[str, Any]]) -> str:
     """Return a Markdown table, a row a way."""
     counted = [row for row in rows if row["number"] > 0]
-    lines = [f"| {' | '.join(HEAD)} |", f"|{'---|' * len(HEAD)}"]
+    lines = []
     usual = np.median([row["seconds"] for row in counted if row["way"] == "default"])
     for way in WAYS:
         own = [row for row in counted if row["way"] == way]
@@ -71,8 +72,8 @@ def tabulate(rows: list[dict[str, Any]]) -> str:
         density = np.array([row["log_density"] for row in own])
         seconds = np.median([row["seconds"] for row in own])
         cells = [way, str(len(own)), f"{seconds:.2f}", f"{seconds / usual:.1f}", " / ".join(shares)]
-        lines.append(f"| {' | '.join(cells)} | {density.mean():.2f} | {np.median(density):.2f} |")
-    return "\n".join(lines)
+        lines.append([*cells, f"{density.mean():.2f}", f"{np.median(density):.2f}"])
+    return format_table(HEAD, lines)
 
 
 def main() -> int:

@@ -25,6 +25,7 @@ from collections.abc import Iterable
 from fnmatch import fnmatch
 from statistics import mean, stdev
 
+from marked import format_table
 from methods import plan
 from programs import HOME, make_parser
 from scipy.stats import t as student_t
@@ -122,8 +123,7 @@ def make_table(rows: list[Row], show: list[str], interval: bool = False, omit: s
     for name in ("method", "variant", "changed"):
         if len(set(columns[name])) == 1 and (len(groups) > 1 or name != "method"):
             del columns[name]
-    lines = [list(columns), ["---"] * len(columns), *zip(*columns.values(), strict=True)]
-    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
+    return format_table(list(columns), zip(*columns.values(), strict=True))
 
 
 def fill_page(text: str, rows: list[Row]) -> str:

@@ -35,7 +35,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 from confidence import degrees_of, is_right_pose, measure_error, summarize_errors
-from marked import put_table, read_rows
+from marked import format_row, put_table, read_rows
 from programs import HOME, make_parser
 
 import posefilter
@@ -173,7 +173,7 @@ def measure_losses(
     said, early, back, there, away = zip(*found, strict=True)
     cells = [estimator.objects[0], scene, str(len(AWAY)), f"{np.mean(said):.1f}"]
     cells += [f"{np.mean(early):.1f}", describe_recovery(back), f"{min(there):.2f}"]
-    return f"| {' | '.join([*cells, f'{max(away):.2f}'])} |"
+    return format_row([*cells, f"{max(away):.2f}"])
 
 
 def describe_recovery(back: Sequence[int | None]) -> str:
@@ -239,7 +239,7 @@ def make_row(
     once, again = (float(np.median([one.seconds for one in some])) for some in (single, tracked))
     cells = [name, scene, str(stride), str(n), *both, lost, f"{once:.2f}"]
     cells += [f"{1000 * again:.0f}", f"{once / again:.0f}"]
-    return f"| {' | '.join(cells)} |"
+    return format_row(cells)
 
 
 def measure_sequence(
@@ -285,7 +285,7 @@ def measure_sequence(
     cells += [average(single, "add_s"), average(scores, "add_s")]
     cells += [f"{np.mean([one.lost for one in scores]):.1f}"]
     cells += [f"{np.mean([sum(one[n].is_tracked for n in covered) for one in tracks]):.1f}"]
-    return f"| {' | '.join([*cells, describe_recovery(back)])} |"
+    return format_row([*cells, describe_recovery(back)])
 
 
 def _with(
@@ -348,7 +348,7 @@ def measure_together(
         cells += [f"{x:.0f}" for x in (np.median(wall), wall.mean(), wall.max())]
         cells += [f"{1000 / wall.mean():.1f}", f"{cpu.mean():.0f}"]
         cells += [f"{np.mean(scores):.1f}", f"{min(scores):.1f}", str(lost)]
-        yield f"| {' | '.join(cells)} |"
+        yield format_row(cells)
 
 
 def run_together(options: argparse.Namespace, names: Sequence[str]) -> None:
@@ -429,7 +429,7 @@ def list_belief_rows(
         cells.append(" / ".join(f"{x:.0f}" for x in found.ellipsoids))
         cells += [f"{x:.1f}" for x in (*found.off, *found.says)]
         cells += [f"{x:.0f}" for x in found.within]
-        yield f"| {' | '.join(cells)} |"
+        yield format_row(cells)
 
 
 def run_beliefs(
