@@ -343,11 +343,8 @@ def tabulate_beliefs(rows: Sequence[Row]) -> str:
                 ]
             )
     head = ["right frames of", "belief", "frames", f"ellipsoids of {LEVELS} %", "credible sets"]
-    head += [
-        "within what it says at 95 %: translation / rotation",
-        "which is in the median",
-        "in the band",
-    ]
+    head += ["within what it says at 95 %: translation / rotation", "which is in the median"]
+    head.append("in the band")
     return format_table([*head, "log density", "levels uniform: p"], lines)
 
 

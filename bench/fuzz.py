@@ -183,13 +183,8 @@ def make_lines(folder: Path) -> dict[str, list[str]]:
         (folder / "video" / picture.stem / "0.png").write_bytes(picture.read_bytes())
     quiet = ["console=json", "threads=1"]
     small = ["debug=smoke", *quiet, "logger=none", "data.progress=false", f"data.root={data}"]
-    small += [
-        "data.limit_train=4",
-        "data.limit_val=1",
-        "data.limit_test=2",
-        "callbacks=checkpoints",
-    ]
-    small += ["trainer.max_steps=2", "trainer.val_check_interval=2"]
+    small += ["data.limit_train=4", "data.limit_val=1", "data.limit_test=2"]
+    small += ["callbacks=checkpoints", "trainer.max_steps=2", "trainer.val_check_interval=2"]
     run_folder = folder / "run"
     done = run("train", [*small, f"out={run_folder}"], folder / "log", before=limit)
     if done.status:
@@ -300,18 +295,9 @@ def change(line: list[str], keys: list[str], folder: Path, rng: random.Random) -
                 place = str(folder / "run.tar")
                 Path(place).write_bytes(bytes(1024))
             names = (
-                "out",
-                "data.root",
-                "rgb",
-                "depth",
-                "checkpoint",
-                "meshes",
-                "data.meshes",
-                "run",
-                "frames",
-                "absent",
-                "bag",
-            )
+                "out", "data.root", "rgb", "depth", "checkpoint", "meshes", "data.meshes", "run",
+                "frames", "absent", "bag",
+            )  # fmt: skip
             typed.append(f"{rng.choice([key for key in names if key in keys] or ['out'])}={place}")
         elif (pair := (rng.choice(keys), rng.choice(ODD))) != SPAWNING:
             typed.append("=".join(pair))

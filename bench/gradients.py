@@ -26,27 +26,16 @@ DESCRIPTIONS = {row.name: f"`{row.name}` {row.description}" for row in ABLATIONS
 STEPS = (1, 2, 4, 8, 16, 30)
 SIZES = {"cnn_patch": "filter.particles=32", "patch_pf": "preset/size=patch_pf"}
 SHOWN = (
-    "paper",
-    "s1_glimpse",
-    "s2_bounded",
-    "c1_normalization",
-    "c2_glimpse",
-    "c3_bounded",
+    "paper", "s1_glimpse", "s2_bounded", "c1_normalization", "c2_glimpse", "c3_bounded",
     "c6_position",
-)
+)  # fmt: skip
 
 
 def gradient(model: str, ablation: str, steps: int, more: Sequence[str]) -> float:
     """Return the norm of the network's gradient of one batch, rolled out for so many steps."""
     with tempfile.TemporaryDirectory() as folder:
-        chosen = [
-            f"model={model}",
-            "experiment=memorize",
-            f"ablation={ablation}",
-            "seed=0",
-            f"filter.steps={steps}",
-            SIZES[model],
-        ]
+        chosen = [f"model={model}", "experiment=memorize", f"ablation={ablation}", "seed=0"]
+        chosen += [f"filter.steps={steps}", SIZES[model]]
         job = compose_job("train", HOME / "conf", [*chosen, *more], Path(folder))
     settle(job.cfg.threads, job.cfg.seed)
     data = build_data(job.cfg.data, "json")

@@ -398,15 +398,8 @@ def command(line: Line, root: Path, more: Sequence[str] = ()) -> list[str]:
         return ["train.py", "-m", *line.words.split(), f"out={out}", "console=json", *more]
     # Hydra's grammar
     quoted = str(evaluated(line.of, root)).replace("=", r"\=").replace(",", r"\,")
-    return [
-        "evaluate.py",
-        "-m",
-        f"checkpoint={quoted}",
-        *line.words.split(),
-        f"out={out}",
-        "console=json",
-        *more,
-    ]
+    words = [f"checkpoint={quoted}", *line.words.split(), f"out={out}", "console=json"]
+    return ["evaluate.py", "-m", *words, *more]
 
 
 def evaluated(of: str, root: Path) -> Path:

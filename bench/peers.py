@@ -37,22 +37,13 @@ from posefilter.memory import keep_freed_memory
 
 PAGE = HOME / "docs" / "results" / "peers.md"
 PHOTOGRAPHED = (
-    "002_master_chef_can",
-    "003_cracker_box",
-    "004_sugar_box",
-    "006_mustard_bottle",
-    "009_gelatin_box",
-    "025_mug",
-    "061_foam_brick",
-)
+    "002_master_chef_can", "003_cracker_box", "004_sugar_box", "006_mustard_bottle",
+    "009_gelatin_box", "025_mug", "061_foam_brick",
+)  # fmt: skip
 RENDERED = (
-    "003_cracker_box",
-    "006_mustard_bottle",
-    "011_banana",
-    "025_mug",
-    "035_power_drill",
+    "003_cracker_box", "006_mustard_bottle", "011_banana", "025_mug", "035_power_drill",
     "048_hammer",
-)
+)  # fmt: skip
 FEW = 2  # validation renders of an object, for tuning
 MANY = {"photographs": 20, "renders": 12}  # images of an object
 PROGRAMS = {

@@ -5,21 +5,10 @@ from typing import NamedTuple
 CRACKER = "weights/003_cracker_box.ckpt"
 # the seed of an object's scenes is its place
 TARGETS = (
-    "035_power_drill",
-    "005_tomato_soup_can",
-    "004_sugar_box",
-    "006_mustard_bottle",
-    "061_foam_brick",
-    "025_mug",
-    "007_tuna_fish_can",
-    "010_potted_meat_can",
-    "011_banana",
-    "002_master_chef_can",
-    "024_bowl",
-    "048_hammer",
-    "009_gelatin_box",
-    "003_cracker_box",
-)
+    "035_power_drill", "005_tomato_soup_can", "004_sugar_box", "006_mustard_bottle",
+    "061_foam_brick", "025_mug", "007_tuna_fish_can", "010_potted_meat_can", "011_banana",
+    "002_master_chef_can", "024_bowl", "048_hammer", "009_gelatin_box", "003_cracker_box",
+)  # fmt: skip
 CLUTTER = ("021_bleach_cleanser", "052_extra_large_clamp")
 _STEPS = "data.augment.steps"
 

@@ -57,14 +57,8 @@ def render_commands(
     objects, as the runs before `shipped` had it, 14 x 180 frames have no more than 180 layouts and
     30 sets of backgrounds and distractors.
     """
-    common = [
-        f"frames={frames}",
-        "frames_per_scene=2",
-        "size=[320,240]",
-        "distractors=[4,10]",
-        f"lookalike_texture={lookalike_texture}",
-        f"meshes={root / 'meshes'}",
-    ]
+    common = [f"frames={frames}", "frames_per_scene=2", "size=[320,240]", "distractors=[4,10]"]
+    common += [f"lookalike_texture={lookalike_texture}", f"meshes={root / 'meshes'}"]
     return [
         ["generate.py", f"out={root / folder / name}", f"object={name}", f"seed={seed}", *common]
         for seed, name in enumerate(TARGETS, start=first_seed)
@@ -81,19 +75,11 @@ def list_sets(root: Path) -> list[list[list[str]]]:
 
 def train_command(run: Run, root: Path, more: Sequence[str] = ()) -> list[str]:
     """Return what to run to train and test one filter on renders."""
-    data = [
-        "data=fat",
-        f"data.root={root / run.scenes}",
-        f"data.meshes={root / 'meshes'}",
-        f"data.object={run.object}",
-        SPLIT if run.scenes == "data" else TRAIN_SPLIT,
-    ]
+    data = ["data=fat", f"data.root={root / run.scenes}", f"data.meshes={root / 'meshes'}"]
+    data += [f"data.object={run.object}", SPLIT if run.scenes == "data" else TRAIN_SPLIT]
     interval = max(500, run.steps // 4)
-    budget = [
-        f"trainer.max_steps={run.steps}",
-        f"trainer.val_check_interval={interval}",
-        "data.min_visibility_test=0.3",
-    ]
+    budget = [f"trainer.max_steps={run.steps}", f"trainer.val_check_interval={interval}"]
+    budget.append("data.min_visibility_test=0.3")
     words = run.words.format(root=root).split()
     validation = [] if "data.limit_val" in run.words else ["data.limit_val=40"]
     out = f"out={root / 'runs' / run.name}"
@@ -107,18 +93,9 @@ def evaluate_commands(run: Run, root: Path, meshes: str, frames: str) -> list[li
     checkpoint = root / "runs" / run.name / "checkpoints" / "best.ckpt"
     photographs = ["data=ycb_video", f"data.root={frames}", f"data.meshes={meshes}"]
     renders = ["data=fat", f"data.root={root / 'data'}", f"data.meshes={root / 'meshes'}"]
-    return [
-        [
-            "evaluate.py",
-            f"checkpoint={checkpoint}",
-            *where,
-            f"out={root / 'evals' / run.name / name}",
-        ]
-        for name, where in (
-            ("photographs", photographs),
-            ("renders", [*renders, "data.limit_test=24"]),
-        )
-    ]
+    tests = {"photographs": photographs, "renders": [*renders, "data.limit_test=24"]}
+    common, out = ["evaluate.py", f"checkpoint={checkpoint}"], root / "evals" / run.name
+    return [[*common, *where, f"out={out / name}"] for name, where in tests.items()]
 
 
 def link_meshes(root: Path, meshes: Path, names: Sequence[str] = (*TARGETS, *CLUTTER)) -> None:

@@ -145,11 +145,8 @@ def measure_likelihood(repeats: int) -> Table:
     lines = []
     for key, title in names.items():
         shares = sorted(100 * a / b for a, b in zip(rates[key], rates["peak"], strict=True))
-        cells = [
-            title,
-            str(dtype).removeprefix("torch."),
-            f"{statistics.median(rates[key]) / 1e9:.0f}",
-        ]
+        rate = statistics.median(rates[key]) / 1e9
+        cells = [title, str(dtype).removeprefix("torch."), f"{rate:.0f}"]
         cells += [f"{x:.0f}" for x in (statistics.median(shares), shares[0], shares[-1])]
         lines.append(format_row(cells))
     return "roofline", SHARES, lines

@@ -139,15 +139,9 @@ def run(posterior: Posterior, particles: int, seed: int, way: str) -> tuple[Beli
 
 
 WAYS = (
-    "search",
-    "search, drawn anew",
-    "search, moved",
-    "islands",
-    "islands, moved",
-    "tempered",
-    "tempered, moved",
-    "exact draws",
-)
+    "search", "search, drawn anew", "search, moved", "islands", "islands, moved", "tempered",
+    "tempered, moved", "exact draws",
+)  # fmt: skip
 POSTERIORS: dict[str, Callable[[int], Posterior]] = {
     "Gaussian": make_gaussian,
     "two modes": make_modes,
