@@ -3,12 +3,15 @@
 from typing import NamedTuple
 
 CRACKER = "weights/003_cracker_box.ckpt"
-# the seed of an object's scenes is its place
-TARGETS = (
-    "035_power_drill", "005_tomato_soup_can", "004_sugar_box", "006_mustard_bottle",
-    "061_foam_brick", "025_mug", "007_tuna_fish_can", "010_potted_meat_can", "011_banana",
-    "002_master_chef_can", "024_bowl", "048_hammer", "009_gelatin_box", "003_cracker_box",
-)  # fmt: skip
+# by what the names of runs begin with; the seed of an object's scenes is its place
+OBJECTS = {
+    "drill": "035_power_drill", "soup": "005_tomato_soup_can", "sugar": "004_sugar_box",
+    "mustard": "006_mustard_bottle", "foam": "061_foam_brick", "mug": "025_mug",
+    "tuna": "007_tuna_fish_can", "meat": "010_potted_meat_can", "banana": "011_banana",
+    "chef": "002_master_chef_can", "bowl": "024_bowl", "hammer": "048_hammer",
+    "gelatin": "009_gelatin_box", "cracker": "003_cracker_box",
+}  # fmt: skip
+TARGETS = tuple(OBJECTS.values())
 CLUTTER = ("021_bleach_cleanser", "052_extra_large_clamp")
 _STEPS = "data.augment.steps"
 
@@ -65,156 +68,135 @@ def plan() -> list[Run]:
     few = f"{short} {first} {_after(CRACKER)}"
     strong = pair.replace(first, "data/augment=strong")
 
-    def run(name: str, target: str, steps: int, start: str, without: str) -> Run:
+    def begun(name: str, model: str, steps: int, words: str) -> Run:
+        return Run(name, OBJECTS[name.split("_")[0]], model, steps, words)
+
+    def run(name: str, steps: int, start: str, without: str) -> Run:
         words = [short, without, _after(start)]
-        return Run(name, target, "pose_pf", steps, " ".join(filter(None, words)))
+        return begun(name, "pose_pf", steps, " ".join(filter(None, words)))
 
-    def far(name: str, target: str, steps: int, start: str = CRACKER) -> Run:
-        return run(name, target, steps, start, first)
+    def far(name: str, steps: int, start: str = CRACKER) -> Run:
+        return run(name, steps, start, first)
 
-    def near(name: str, target: str, steps: int, start: str = CRACKER) -> Run:
-        return run(name, target, steps, start, f"{PLAIN} {NEAR}")
+    def near(name: str, steps: int, start: str = CRACKER) -> Run:
+        return run(name, steps, start, f"{PLAIN} {NEAR}")
 
-    def dim(name: str, target: str, steps: int, start: str) -> Run:
-        return run(name, target, steps, start, f"{DIM} {NEAR}")
+    def dim(name: str, steps: int, start: str) -> Run:
+        return run(name, steps, start, f"{DIM} {NEAR}")
 
-    def now(name: str, target: str, steps: int, start: str) -> Run:
-        return run(name, target, steps, start, "")
+    def now(name: str, steps: int, start: str) -> Run:
+        return run(name, steps, start, "")
 
-    def more(name: str, target: str, steps: int, start: str) -> Run:
+    def more(name: str, steps: int, start: str) -> Run:
         """From here on, the likelihood learns from all 16 images of a batch, and not from 8."""
-        return run(name, target, steps, _best(start), "model.likelihood_batch_size=16")
+        return run(name, steps, _best(start), "model.likelihood_batch_size=16")
 
-    def shipped(name: str, target: str, steps: int) -> Run:
+    def shipped(name: str, steps: int) -> Run:
         """From here on, scenes differ from object to object; begun with what shipped."""
-        return run(name, target, steps, f"weights/{target}.ckpt", "model.likelihood_batch_size=16")
+        weights = f"weights/{OBJECTS[name.split('_')[0]]}.ckpt"
+        return run(name, steps, weights, "model.likelihood_batch_size=16")
 
-    mustard, sugar, drill = "006_mustard_bottle", "004_sugar_box", "035_power_drill"
-    gelatin, mug, foam = "009_gelatin_box", "025_mug", "061_foam_brick"
-    chef, soup, meat = "002_master_chef_can", "005_tomato_soup_can", "010_potted_meat_can"
     earlier = [
-        Run("mustard_pose_camera", mustard, "pose_pf", 300, f"data/augment=camera {pair}"),
-        Run("mustard_pose_strong", mustard, "pose_pf", 300, strong),
-        Run("sugar_pose_camera", sugar, "pose_pf", 300, few),
-        Run("mug_pose_camera", mug, "pose_pf", 300, few),
-        Run("gelatin_pose_camera", gelatin, "pose_pf", 250, few),
-        Run("chef_can_pose_camera", chef, "pose_pf", 200, few),
-        Run("foam_pose_camera", foam, "pose_pf", 150, few),
-        Run("drill_pose_camera", drill, "pose_pf", 300, few),
-        Run("drill_patch_camera", drill, "patch_pf", 4000, whole),
-        Run("mustard_patch_camera", mustard, "patch_pf", 1000, after_drill),
-        Run("sugar_patch_camera", sugar, "patch_pf", 1000, after_drill),
-        far("gelatin_a", gelatin, 1000, _best("gelatin_pose_camera")),
-        near("gelatin_b", gelatin, 600, _best("gelatin_a")),
-        near("gelatin_c", gelatin, 500, _best("gelatin_b")),
-        far("mug_a", mug, 1000, _best("mug_pose_camera")),
-        near("mug_b", mug, 600, _best("mug_a")),
-        dim("mug_c", mug, 800, _best("mug_b")),
-        far("foam_a", foam, 1000),
-        near("foam_b", foam, 600, _best("foam_a")),
-        dim("foam_c", foam, 1000, _best("foam_b")),
-        run("foam_d", foam, 800, _best("foam_c"), NEAR),
-        now("foam_e", foam, 500, _best("foam_d")),
-        near("chef_b", chef, 700, _best("chef_can_pose_camera")),
-        near("chef_c", chef, 900, _best("chef_b")),
-        near("drill_b", drill, 900),
-        now("drill_c", drill, 600, _best("drill_b")),
-        near("meat_b", meat, 350),
-        now("meat_c", meat, 500, _best("meat_b")),
-        near("soup_b", soup, 350),
-        near("soup_c", soup, 450, _best("soup_b")),
-        near("soup_d", soup, 800, _best("soup_c")),
-        now("soup_e", soup, 400, _best("soup_d")),
-        near("sugar_b", sugar, 400, _best("sugar_pose_camera")),
-        near("mustard_b", mustard, 400, _best("mustard_pose_camera")),
-        now("bowl_b", "024_bowl", 500, _best("mug_c")),
-        now("tuna_b", "007_tuna_fish_can", 500, _best("soup_d")),
-        now("hammer_b", "048_hammer", 500, _best("drill_c")),
-        near("banana_b", "011_banana", 350),
-        more("foam_f", foam, 800, "foam_d"),
-        more("soup_f", soup, 800, "soup_e"),
-        more("mug_d", mug, 700, "mug_c"),
-        more("tuna_c", "007_tuna_fish_can", 700, "tuna_b"),
-        more("hammer_c", "048_hammer", 800, "hammer_b"),
-        more("chef_d", chef, 600, "chef_c"),
-        more("banana_c", "011_banana", 800, "banana_b"),
-        more("bowl_c", "024_bowl", 700, "bowl_b"),
-        more("meat_d", meat, 700, "meat_c"),
-        more("drill_d", drill, 600, "drill_c"),
-        more("mustard_c", mustard, 500, "mustard_b"),
-        more("sugar_c", sugar, 500, "sugar_b"),
-        more("drill_e", drill, 1200, "drill_d"),  # the control of drill_f
-        shipped("soup_g", soup, 1200),
-        shipped("foam_g", foam, 1000),
-        shipped("drill_f", drill, 1200),
-        shipped("sugar_d", sugar, 1000),
-        shipped("mug_e", mug, 1000),
-        shipped("mustard_d", mustard, 1000),
-        shipped("chef_e", chef, 900),
-        run("foam_h", foam, 900, _best("foam_g"), "model.likelihood_batch_size=16"),
-        run("foam_i", foam, 900, _best("foam_h"), "model.likelihood_batch_size=16"),
-        shipped("meat_e", meat, 700),
-        shipped("tuna_d", "007_tuna_fish_can", 1000),
-        shipped("banana_d", "011_banana", 1000),
-        shipped("bowl_d", "024_bowl", 1000),
-        shipped("hammer_d", "048_hammer", 1000),
-        shipped("gelatin_d", gelatin, 1000),
-        shipped("cracker_c", "003_cracker_box", 1000),
-        shipped("chef_f", chef, 1000),
-        shipped("soup_h", soup, 1000),
-        shipped("drill_g", drill, 1000),
-        shipped("mug_f", mug, 1500),
-        more("mug_g", mug, 1000, "mug_f"),
-        shipped("hammer_e", "048_hammer", 1000),
+        begun("mustard_pose_camera", "pose_pf", 300, f"data/augment=camera {pair}"),
+        begun("mustard_pose_strong", "pose_pf", 300, strong),
+        begun("sugar_pose_camera", "pose_pf", 300, few),
+        begun("mug_pose_camera", "pose_pf", 300, few),
+        begun("gelatin_pose_camera", "pose_pf", 250, few),
+        begun("chef_can_pose_camera", "pose_pf", 200, few),
+        begun("foam_pose_camera", "pose_pf", 150, few),
+        begun("drill_pose_camera", "pose_pf", 300, few),
+        begun("drill_patch_camera", "patch_pf", 4000, whole),
+        begun("mustard_patch_camera", "patch_pf", 1000, after_drill),
+        begun("sugar_patch_camera", "patch_pf", 1000, after_drill),
+        far("gelatin_a", 1000, _best("gelatin_pose_camera")),
+        near("gelatin_b", 600, _best("gelatin_a")),
+        near("gelatin_c", 500, _best("gelatin_b")),
+        far("mug_a", 1000, _best("mug_pose_camera")),
+        near("mug_b", 600, _best("mug_a")),
+        dim("mug_c", 800, _best("mug_b")),
+        far("foam_a", 1000),
+        near("foam_b", 600, _best("foam_a")),
+        dim("foam_c", 1000, _best("foam_b")),
+        run("foam_d", 800, _best("foam_c"), NEAR),
+        now("foam_e", 500, _best("foam_d")),
+        near("chef_b", 700, _best("chef_can_pose_camera")),
+        near("chef_c", 900, _best("chef_b")),
+        near("drill_b", 900),
+        now("drill_c", 600, _best("drill_b")),
+        near("meat_b", 350),
+        now("meat_c", 500, _best("meat_b")),
+        near("soup_b", 350),
+        near("soup_c", 450, _best("soup_b")),
+        near("soup_d", 800, _best("soup_c")),
+        now("soup_e", 400, _best("soup_d")),
+        near("sugar_b", 400, _best("sugar_pose_camera")),
+        near("mustard_b", 400, _best("mustard_pose_camera")),
+        now("bowl_b", 500, _best("mug_c")),
+        now("tuna_b", 500, _best("soup_d")),
+        now("hammer_b", 500, _best("drill_c")),
+        near("banana_b", 350),
+        more("foam_f", 800, "foam_d"),
+        more("soup_f", 800, "soup_e"),
+        more("mug_d", 700, "mug_c"),
+        more("tuna_c", 700, "tuna_b"),
+        more("hammer_c", 800, "hammer_b"),
+        more("chef_d", 600, "chef_c"),
+        more("banana_c", 800, "banana_b"),
+        more("bowl_c", 700, "bowl_b"),
+        more("meat_d", 700, "meat_c"),
+        more("drill_d", 600, "drill_c"),
+        more("mustard_c", 500, "mustard_b"),
+        more("sugar_c", 500, "sugar_b"),
+        more("drill_e", 1200, "drill_d"),  # the control of drill_f
+        shipped("soup_g", 1200),
+        shipped("foam_g", 1000),
+        shipped("drill_f", 1200),
+        shipped("sugar_d", 1000),
+        shipped("mug_e", 1000),
+        shipped("mustard_d", 1000),
+        shipped("chef_e", 900),
+        run("foam_h", 900, _best("foam_g"), "model.likelihood_batch_size=16"),
+        run("foam_i", 900, _best("foam_h"), "model.likelihood_batch_size=16"),
+        shipped("meat_e", 700),
+        shipped("tuna_d", 1000),
+        shipped("banana_d", 1000),
+        shipped("bowl_d", 1000),
+        shipped("hammer_d", 1000),
+        shipped("gelatin_d", 1000),
+        shipped("cracker_c", 1000),
+        shipped("chef_f", 1000),
+        shipped("soup_h", 1000),
+        shipped("drill_g", 1000),
+        shipped("mug_f", 1500),
+        more("mug_g", 1000, "mug_f"),
+        shipped("hammer_e", 1000),
     ]
     # from here on, the likelihood has its surface term
-    first = [
-        ("meat", meat),
-        ("hammer", "048_hammer"),
-        ("foam", foam),
-        ("mug", mug),
-        ("drill", drill),
-        ("banana", "011_banana"),
-        ("mustard", mustard),
-        ("chef", chef),
-        ("bowl", "024_bowl"),
-        ("cracker", "003_cracker_box"),
-        ("tuna", "007_tuna_fish_can"),
-        ("soup", soup),
-        ("sugar", sugar),
-    ]
-    judged = [shipped(f"{name}_s", target, 600) for name, target in first]
-    judged.append(more("mug_t", mug, 600, "mug_s"))
+    names = (
+        "meat", "hammer", "foam", "mug", "drill", "banana", "mustard", "chef", "bowl", "cracker",
+        "tuna", "soup", "sugar",
+    )  # fmt: skip
+    judged = [shipped(f"{name}_s", 600) for name in names]
+    judged.append(more("mug_t", 600, "mug_s"))
     # from here on, of the third set
-    third = [
-        ("meat", meat, 2000),
-        ("bowl", "024_bowl", 2000),
-        ("hammer", "048_hammer", 2000),
-        ("mug", mug, 2000),
-        ("banana", "011_banana", 1600),
-        ("tuna", "007_tuna_fish_can", 2000),
-        ("sugar", sugar, 2000),
-        ("mustard", mustard, 2000),
-        ("cracker", "003_cracker_box", 4000),
-        ("chef", chef, 1600),
-        ("gelatin", gelatin, 1600),
-        ("foam", foam, 1600),
-    ]
-    judged += [shipped(f"{name}_u", *rest)._replace(scenes=THIRD) for name, *rest in third]
+    steps = {
+        "meat": 2000, "bowl": 2000, "hammer": 2000, "mug": 2000, "banana": 1600, "tuna": 2000,
+        "sugar": 2000, "mustard": 2000, "cracker": 4000, "chef": 1600, "gelatin": 1600,
+        "foam": 1600,
+    }  # fmt: skip
+    third = [shipped(f"{name}_u", count) for name, count in steps.items()]
     # after turns by texture
-    fourth = [("sugar", sugar, 3000), ("mug", mug, 2000), ("soup", soup, 1500)]
-    judged += [shipped(f"{name}_v", *rest)._replace(scenes=THIRD) for name, *rest in fourth]
+    third += [shipped("sugar_v", 3000), shipped("mug_v", 2000), shipped("soup_v", 1500)]
+    judged += [one._replace(scenes=THIRD) for one in third]
     # of the fourth set, validated at the end alone
-    for name, target in (("sugar", sugar), ("mug", mug)):
-        last = shipped(f"{name}_w", target, 1200)
+    for name in ("sugar_w", "mug_w"):
+        last = shipped(name, 1200)
         words = f"{last.words} trainer.val_check_interval=1200"
         judged.append(last._replace(words=words, scenes=FOURTH))
     # of the fifth set, many images magnified as windows are; validated at the end alone
-    fifth = [("banana", "011_banana"), ("hammer", "048_hammer"), ("gelatin", gelatin), ("mug", mug)]
-    fifth += [("mustard", mustard), ("tuna", "007_tuna_fish_can")]
     sized = f"{_STEPS}.1.object_size_probability=0.4 trainer.val_check_interval=1500"
-    for name, target in fifth:
-        last = shipped(f"{name}_x", target, 1500)
+    for name in ("banana", "hammer", "gelatin", "mug", "mustard", "tuna"):
+        last = shipped(f"{name}_x", 1500)
         words = f"{last.words.replace('=camera ', '=camera_magnified ')} {sized}"
         judged.append(last._replace(words=words, scenes=FIFTH))
     return [*map(_without_surface, earlier), *judged]
