@@ -67,10 +67,8 @@ class Figures(TraceCallback):
                 f"{', '.join(DRAWINGS)}"
             )
         super().__init__(folder)
-        self.every_n_validations, self.counts = (
-            every_n_validations,
-            {"first": first, "best": best, "worst": worst},
-        )
+        self.every_n_validations = every_n_validations
+        self.counts = {"first": first, "best": best, "worst": worst}
         self.drawings = {name: draw for name, draw in DRAWINGS.items() if name not in exclude}
         self.budget = Budget(max_time_fraction)
         self._validations = 0

@@ -34,16 +34,13 @@ Setting = bool | int | float | str
 # method does not log, its charts leave out.
 LAYOUT: dict[str, dict[str, list[str]]] = {
     "1  Does it work?": {
-        "score on validation (ADD AUC, or mean of box IoU and particles on the object)": [
-            "val/score$"
-        ],
+        "score on validation (ADD AUC, or mean of box IoU and particles on the object)":
+            ["val/score$"],
         "AUC of ADD and ADD-S": [r"val/add/auc$", r"val/add_s/auc$"],
         "median error [mm]": [r"val/add/median_mm$", r"val/add_s/median_mm$"],
         "found: share of the images [%]": [r"val/add/recall_01d$", r"val/add/recall_2cm$"],
-        "box IoU, and share of the particles on the object": [
-            r"val/iou$",
-            r"val/particles_on_object$",
-        ],
+        "box IoU, and share of the particles on the object":
+            [r"val/iou$", r"val/particles_on_object$"],
     },
     "2  Does it learn?": {
         "losses": [r"train/loss(_.*)?$"],
@@ -51,9 +48,8 @@ LAYOUT: dict[str, dict[str, list[str]]] = {
         "learning rate": [r"train/learning_rate$"],
     },
     "3  What do the particles do?": {
-        "effective sample size over the number of particles, by iteration": [
-            r"filter/ess/step_\d+$"
-        ],
+        "effective sample size over the number of particles, by iteration":
+            [r"filter/ess/step_\d+$"],
         "spread of the centers [m], by iteration": [r"filter/spread_m/step_\d+$"],
         "spread of the rotations [rad], by iteration": [r"filter/spread_rad/step_\d+$"],
         "spread [px], by iteration": [r"filter/spread_px/step_\d+$"],
@@ -61,25 +57,21 @@ LAYOUT: dict[str, dict[str, list[str]]] = {
         "diagnostics at the last iteration": [r"diagnostics/.*/last$"],
     },
     "4  Is the belief calibrated?": {
-        "coverage of the 50 % and 90 % mean-distance regions [%]": [
-            r"val/belief/(distance_)?coverage_\d+$"  # both: a run that was begun before
-        ],
+        "coverage of the 50 % and 90 % mean-distance regions [%]":  # both: a run begun before
+            [r"val/belief/(distance_)?coverage_\d+$"],
         "coverage of the 50 % and 90 % credible sets [%]": [r"val/credibility/coverage_(50|90)$"],
         "weight near the truth": [r"val/belief/mass_.*"],
-        "share of the images in which a particle outscores the truth": [
-            r"val/belief/truth_outscored.*"
-        ],
+        "share of the images in which a particle outscores the truth":
+            [r"val/belief/truth_outscored.*"],
     },
     "5  How fast?": {
-        "images a second, in training and in validation": [
-            r"speed/(train|validation)_images_per_second$"
-        ],
+        "images a second, in training and in validation":
+            [r"speed/(train|validation)_images_per_second$"],
         "share of the training that waits for data": [r"speed/waiting_fraction$"],
-        "validation: seconds, and the share of them that is drawing": [
-            r"speed/(validation_seconds|drawing_fraction)$"
-        ],
+        "validation: seconds, and the share of them that is drawing":
+            [r"speed/(validation_seconds|drawing_fraction)$"],
     },
-}
+}  # fmt: skip
 
 # What the tab HParams shows of a run, in this order: the validation's score so far and its best,
 # and what the test found.
@@ -156,9 +148,17 @@ def describe_run(
     Returns:
         The columns of the table, and the run's line.
     """
-    values = {name: convert_setting(value) for name, value in settings.items()}
+    # numbers as such, the rest in words
+    values = {k: str(v).lower() if isinstance(v, bool) else v for k, v in settings.items()}
     first = {*FIRST, *swept}
-    columns = [describe_column(name, value, name in first) for name, value in values.items()]
+    columns = [
+        HParamInfo(
+            name=name,
+            type=DATA_TYPE_STRING if isinstance(value, str) else DATA_TYPE_FLOAT64,
+            differs=name in first,  # shown without being asked for
+        )
+        for name, value in values.items()
+    ]
     metrics = [
         MetricColumn(
             name=MetricName(tag=tag), display_name=f"{tag.split('/')[0]}: {find_metric(tag).title}"
@@ -171,16 +171,3 @@ def describe_run(
     metadata = create_summary_metadata(content)
     value = Summary.Value(tag=EXPERIMENT_TAG, metadata=metadata, tensor=NULL_TENSOR)
     return Summary(value=[value]), start
-
-
-def describe_column(name: str, value: float | str, first: bool) -> HParamInfo:
-    """Return a setting's column; `first`: whether it is among those that are shown without being
-    asked for.
-    """
-    kind = DATA_TYPE_STRING if isinstance(value, str) else DATA_TYPE_FLOAT64
-    return HParamInfo(name=name, type=kind, differs=first)
-
-
-def convert_setting(value: Setting) -> float | str:
-    """Return a setting as TensorBoard can show it: numbers as such, the rest in words."""
-    return str(value).lower() if isinstance(value, bool) else value

@@ -5,8 +5,6 @@ particles, once a step. What is between them is a hundred lines of linear algebr
 examples/onnx.
 """
 
-from typing import Any
-
 import torch
 from torch import Tensor, nn
 
@@ -19,7 +17,7 @@ from posefilter.nets.encoders import ContextMap
 from posefilter.nets.likelihood import Pixels, PoseLikelihood, flatten_images, sample_points
 from posefilter.nets.pose_votes import measure_cells
 from posefilter.nets.proposals import ObjectCoordinateNet
-from posefilter.types import Particles, Step
+from posefilter.types import Batch, Particles, Step
 
 ENCODING = ("values", "smooth", "share", "position", "network_intrinsics")
 
@@ -232,9 +230,7 @@ class MeasurePixels(nn.Module):
         return tuple(one[0] for one in found)
 
 
-def _batch(color: Tensor, z: Tensor, K: Tensor) -> Any:
-    from posefilter.types import Batch
-
+def _batch(color: Tensor, z: Tensor, K: Tensor) -> Batch:
     none = color.new_zeros(1, dtype=torch.int64)
     mask = torch.zeros_like(z, dtype=torch.bool)
     return Batch(color, z, mask, K, torch.eye(4)[None], none, none, color.new_full((1,), torch.nan))

@@ -197,10 +197,8 @@ def describe(shown: ViewData) -> str:
         "| pose | weight | center x, y, z [mm] | from the estimate [mm] | rotated by |",
         "|---|---|---|---|---|",
     ]
-    for name, one in [
-        ("estimate", shown.estimate),
-        *((f"mode {i}", m) for i, m in enumerate(shown.others, start=1)),
-    ]:
+    modes = ((f"mode {i}", mode) for i, mode in enumerate(shown.others, start=1))
+    for name, one in [("estimate", shown.estimate), *modes]:
         center, best = (
             p[:3, :3] @ shown.center + p[:3, 3] for p in (one.pose, shown.estimate.pose)
         )
@@ -216,11 +214,9 @@ def describe(shown: ViewData) -> str:
     lines += [
         "",
         f"Time line `{TIMELINE}`: 0 to {steps - 1} are the filter's steps, {steps} is the belief "
-        f"that it ends with. A dot"
-        " is where a particle puts the object's center, dark for light weights and yellow for "
-        "heavy ones; red, green and"
-        " blue are the object's x, y and z. The box is the estimate's, at every step."
-        " Camera frame: x right, y down, z ahead, meters.",
+        "that it ends with. A dot is where a particle puts the object's center, dark for light "
+        "weights and yellow for heavy ones; red, green and blue are the object's x, y and z. The "
+        "box is the estimate's, at every step. Camera frame: x right, y down, z ahead, meters.",
     ]
     return "\n".join(lines)
 

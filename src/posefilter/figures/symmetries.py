@@ -66,8 +66,7 @@ def _measure(turn: RotationalSymmetry) -> str:
     texture = "same texture" if turn.texture else "another texture"
     return (
         f"surface {1000 * max(turn.distance, 0):.1f} mm off, farthest "
-        f"{1000 * max(turn.far, 0):.1f} "
-        f"mm; color difference {turn.color:.2f}: {texture}"
+        f"{1000 * max(turn.far, 0):.1f} mm; color difference {turn.color:.2f}: {texture}"
     )
 
 

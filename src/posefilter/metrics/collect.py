@@ -132,14 +132,8 @@ class BeliefQuality(Rows):
     """
 
     names = (
-        "entropy",
-        "effective_particles",
-        "spread_m",
-        "spread_rad",
-        "mass_01d",
-        "mass_2cm",
-        "rank",
-    )
+        "entropy", "effective_particles", "spread_m", "spread_rad", "mass_01d", "mass_2cm", "rank",
+    )  # fmt: skip
 
     def __init__(self, object_model: ObjectModel, points: int = 256, **kwargs: Any) -> None:
         super().__init__(**kwargs)

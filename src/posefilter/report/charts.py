@@ -30,19 +30,13 @@ class Theme(NamedTuple):
 
 
 LIGHT = Theme(
-    "light",
-    "#ffffff",
-    "#1c2430",
-    "#8a93a3",
+    "light", "#ffffff", "#1c2430", "#8a93a3",
     ("#2563c9", "#d9650d", "#0f8a5f", "#a03bb0", "#b58900", "#5b6675"),
-)
+)  # fmt: skip
 DARK = Theme(
-    "dark",
-    "#171b23",
-    "#e4e8ef",
-    "#7d8797",
+    "dark", "#171b23", "#e4e8ef", "#7d8797",
     ("#7aa8ff", "#ffa657", "#4fcf9d", "#d79be6", "#e6cf6a", "#a5afbf"),
-)
+)  # fmt: skip
 
 
 @dataclass(frozen=True)

@@ -39,17 +39,11 @@ class Finding(NamedTuple):
 
 DIAGNOSTICS = (
     Diagnostic("missed_fraction", 0.0, "The filter gave no finite pose."),
-    Diagnostic(
-        "belief/truth_outscored_by_wrong",
-        0.02,
-        "The likelihood prefers a wrong pose: no amount of searching would help.",
-    ),
+    Diagnostic("belief/truth_outscored_by_wrong", 0.02,
+        "The likelihood prefers a wrong pose: no amount of searching would help."),
     Diagnostic("belief/distance_coverage_90", 75.0, "Estimates are wrong, or beliefs too narrow."),
-    Diagnostic(
-        "credibility/coverage_90",
-        80.0,
-        "Credible sets miss the truth: estimates are wrong, or beliefs too narrow.",
-    ),
+    Diagnostic("credibility/coverage_90", 80.0,
+        "Credible sets miss the truth: estimates are wrong, or beliefs too narrow."),
     Diagnostic("diagnostics/pairwise_cosine", 0.8, "All particles move in one direction."),
     Diagnostic("diagnostics/offset_r2", 0.1, "Displacements say no more than their mean would."),
     Diagnostic("diagnostics/heading", 0.2, "Particles do not head for the object."),
@@ -60,7 +54,7 @@ DIAGNOSTICS = (
     Diagnostic("particles_on_object", 0.2, "Few particles find the object."),
     Diagnostic("val_score_drop", 5.0, "Training went past its best: see the curves."),
     Diagnostic("not_finite", 0.0, "The training diverged."),
-)
+)  # fmt: skip
 
 
 def diagnose(run: Run) -> list[Finding]:

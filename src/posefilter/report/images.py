@@ -19,31 +19,14 @@ SECTIONS = {  # the first whose words a picture's name has; what is in none is "
     "best": {"best"},
     "overlays": {"overlay", "overlays", "estimate", "estimates", "pose", "poses"},
     "belief": {
-        "belief",
-        "beliefs",
-        "so3",
-        "rotations",
-        "likelihood",
-        "field",
-        "points",
-        "proposals",
-        "objectness",
-        "marginals",
+        "belief", "beliefs", "so3", "rotations", "likelihood", "field", "points", "proposals",
+        "objectness", "marginals",
     },
     "particles": {
-        "trajectories",
-        "particles",
-        "cloud",
-        "clouds",
-        "animation",
-        "video",
-        "row",
-        "silhouettes",
-        "diagnostics",
-        "health",
-        "filter",
+        "trajectories", "particles", "cloud", "clouds", "animation", "video", "row", "silhouettes",
+        "diagnostics", "health", "filter",
     },
-}
+}  # fmt: skip
 LARGEST_PX = 2000
 WIDE_PX = 900  # from which width on an image is several in a row, which a phone scrolls
 KEPT_BYTES = 60_000

@@ -18,29 +18,23 @@ VALIDATION = {
 BELIEF = {
     "Belief near the truth": ("val/belief/mass_01d", "val/belief/mass_2cm"),
     "Coverage of the mean-distance regions": (
-        "val/belief/distance_coverage_50",
-        "val/belief/distance_coverage_90",
+        "val/belief/distance_coverage_50", "val/belief/distance_coverage_90",
     ),
     "Truth outscored": ("val/belief/truth_outscored", "val/belief/truth_outscored_by_wrong"),
     "Effective sample size": ("val/belief/effective_particles",),
     "Spread of the centers": ("val/belief/spread_m",),
     "Spread of the rotations": ("val/belief/spread_rad",),
-}
+}  # fmt: skip
 SIGNS = {
     "Where particles end": (
-        "diagnostics/on_object/last",
-        "diagnostics/off_frame/last",
-        "diagnostics/near_edge/last",
-        "diagnostics/near_corner/last",
-        "diagnostics/line_share/last",
+        "diagnostics/on_object/last", "diagnostics/off_frame/last", "diagnostics/near_edge/last",
+        "diagnostics/near_corner/last", "diagnostics/line_share/last",
     ),
     "Displacements": (
-        "val/diagnostics/pairwise_cosine",
-        "val/diagnostics/offset_r2",
-        "val/diagnostics/heading",
+        "val/diagnostics/pairwise_cosine", "val/diagnostics/offset_r2", "val/diagnostics/heading",
     ),
     "Likelihood": ("val/diagnostics/auroc",),
-}
+}  # fmt: skip
 
 
 def choose_panels(curves: Mapping[str, Curve], charts: Mapping[str, Sequence[str]]) -> list[Panel]:

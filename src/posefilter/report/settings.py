@@ -4,15 +4,8 @@ import json
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
-PASSING = (
-    "out",
-    "folder",
-    "console",
-    "threads",
-    "resume",
-    "debug",
-    "plugins",
-)  # where and how a run was made, not what it was
+# where and how a run was made, not what it was
+PASSING = ("out", "folder", "console", "threads", "resume", "debug", "plugins")
 
 
 class Change(NamedTuple):
@@ -26,13 +19,10 @@ class Change(NamedTuple):
 def compare_settings(config: Mapping[str, Any], default: Mapping[str, Any]) -> list[Change]:
     """Return the settings that differ, in the run's order, those that it lacks last."""
     own, usual = flatten_settings(config), flatten_settings(default)
-    keys = [
-        key
-        for key in (*own, *(k for k in usual if k not in own))
-        if key.split(".")[0] not in PASSING
-    ]
     return [
-        Change(key, usual.get(key), own.get(key)) for key in keys if own.get(key) != usual.get(key)
+        Change(key, usual.get(key), own.get(key))
+        for key in own | usual
+        if key.split(".")[0] not in PASSING and own.get(key) != usual.get(key)
     ]
 
 
