@@ -16,24 +16,14 @@ from posefilter.types import ObjectModel
 
 
 class BeliefSummary(NamedTuple):
-    """How sure a belief about one image is.
+    """How sure a belief about one image is."""
 
-    Attributes:
-        translation: Root mean square distance of the centers in the estimate's mode from their
-            mean [m].
-        rotation: The same of the rotations [rad].
-        share: Weight of the estimate's mode, 0 where the estimate belongs to none.
-        second: The heaviest of the other modes, None where there is none that counts.
-        second_translation: How far its center is from the estimate's [m].
-        second_rotation: By how much it is turned from the estimate [rad].
-    """
-
-    translation: float
-    rotation: float
-    share: float
-    second: Hypothesis | None
-    second_translation: float
-    second_rotation: float
+    translation: float  # root mean square distance of the estimate's mode's centers from their mean
+    rotation: float  # the same of the rotations [rad]
+    share: float  # weight of the estimate's mode, 0 where the estimate belongs to none
+    second: Hypothesis | None  # the heaviest of the other modes, if one counts
+    second_translation: float  # how far its center is from the estimate's [m]
+    second_rotation: float  # by how much it is turned from the estimate [rad]
 
 
 def summarize_belief(

@@ -41,22 +41,14 @@ class Paragraph:
 
 @dataclass(frozen=True)
 class Table:
-    """A table, which scrolls within itself where it is too wide; without rows it is left out.
-
-    Attributes:
-        head: The columns' names; no head where all are empty.
-        rows: Cells, row by row.
-        numeric: Columns of numbers.
-        marked: A row that stands out.
-        form: How it folds on a phone, or `narrow`; see page.css.
-    """
+    """A table, which scrolls within itself where it is too wide; without rows it is left out."""
 
     kind: ClassVar = "table"
-    head: Sequence[str]
+    head: Sequence[str]  # the columns' names; no head where all are empty
     rows: Sequence[Sequence[Cell]]
-    numeric: Sequence[int] = ()
-    marked: int | None = None
-    form: str = ""
+    numeric: Sequence[int] = ()  # columns of numbers
+    marked: int | None = None  # a row that stands out
+    form: str = ""  # how it folds on a phone, or `narrow`; see page.css
 
 
 @dataclass(frozen=True)

@@ -12,25 +12,15 @@ from posefilter.report.blocks import Block, Charts, Fold, Paragraph, Section, Ta
 
 @dataclass(frozen=True)
 class Page:
-    """All that a page says.
+    """All that a page says."""
 
-    Attributes:
-        title: Of the window.
-        heading: What is read first.
-        lines: Below the heading.
-        tiles: The main numbers.
-        notes: What a reader should know before the rest, a sentence each.
-        sections: The rest; those without content are left out.
-        foot: Where the page is from.
-    """
-
-    title: str
-    heading: str
-    lines: Sequence[Paragraph]
-    tiles: Sequence[Tile]
-    notes: Sequence[str]
-    sections: Sequence[Section]
-    foot: Paragraph
+    title: str  # of the window
+    heading: str  # what is read first
+    lines: Sequence[Paragraph]  # below the heading
+    tiles: Sequence[Tile]  # the main numbers
+    notes: Sequence[str]  # what a reader should know before the rest, a sentence each
+    sections: Sequence[Section]  # the rest; those without content are left out
+    foot: Paragraph  # where the page is from
 
     def render(self) -> str:
         """Return the page as HTML.  Whatever its content holds is escaped."""
@@ -39,19 +29,12 @@ class Page:
         ]
         file = resources.files("posefilter.report").joinpath("templates", "page.css")
         style = file.read_text(encoding="utf-8")
-        return (
-            open_templates()
-            .get_template("page.html")
-            .render(page=self, sections=sections, style=style)
-        )
+        template = open_templates().get_template("page.html")
+        return template.render(page=self, sections=sections, style=style)
 
     def files(self) -> dict[str, bytes]:
         """Return the charts of the page as PNGs by file name."""
-        return {
-            name: png
-            for section in self.sections
-            for name, png in find_charts(section.blocks).items()
-        }
+        return find_charts([block for section in self.sections for block in section.blocks])
 
 
 def drop_empty(blocks: Sequence[Block]) -> list[Block]:
