@@ -9,9 +9,9 @@ import numpy as np
 import torch
 from lightning import LightningModule, Trainer
 
-from posefilter.callbacks.drawings import AnimatedScene, animate
+from posefilter.callbacks.drawings import animate
 from posefilter.callbacks.gallery import name_frame, select_image
-from posefilter.callbacks.tensorboard import Budget, post_image
+from posefilter.callbacks.tensorboard import Budget, log_numbers, post_image
 from posefilter.callbacks.trace_callback import TraceCallback
 from posefilter.callbacks.trajectories import trace_lineage
 from posefilter.figures.canvas import AXES, Color, to_image
@@ -66,10 +66,7 @@ class Diagnostics(TraceCallback):
         if "diagnostics" not in scores or trainer.sanity_checking or not trainer.is_global_zero:
             return
         found = cast(FilterDiagnostics, scores["diagnostics"]).compute()
-        for logger in trainer.loggers:
-            logger.log_metrics(
-                {f"diagnostics/{name}/last": found[name][-1] for name in LISTS}, trainer.global_step
-            )
+        log_numbers(trainer, {f"diagnostics/{name}/last": found[name][-1] for name in LISTS})
         step = trainer.global_step
 
         def draw() -> None:
@@ -110,9 +107,8 @@ class Diagnostics(TraceCallback):
             post_image(trainer, f"trajectories_{i}", picture, self.folder, "test")
             pair = (batch.intrinsics, batch.camera_from_object)
             K, truth = (x[i].cpu().double().numpy() for x in pair)
-            scene = AnimatedScene(rgb, K, truth, mask)
             title = f"The filter at work\n{name} of the test"
-            animation = animate(method, select_image(trace, i), scene, title)
+            animation = animate(method, select_image(trace, i), rgb, K, truth, mask, title)
             post_image(trainer, f"animation_{i}", animation, self.folder, "test")
 
 

@@ -188,26 +188,27 @@ def glimpses(o: Occasion) -> Drawn:
 
 def animation(o: Occasion) -> Drawn:
     """Animate the filter at work."""
-    scene = AnimatedScene(o.one.rgb, o.one.intrinsics, o.one.truth, o.mask())
-    return animate(o.method, o.trace, scene, o.title("The filter at work"))
+    where = (o.one.rgb, o.one.intrinsics, o.one.truth, o.mask())
+    return animate(o.method, o.trace, *where, o.title("The filter at work"))
 
 
-class AnimatedScene(NamedTuple):
-    """The image that an animation is of."""
+def animate(
+    method: PoseEstimator,
+    trace: Trace,
+    rgb: np.ndarray,
+    K: np.ndarray,
+    truth: np.ndarray,
+    mask: np.ndarray,
+    title: str,
+) -> bytes:
+    """Animate the filter on one image, whose trace this is.
 
-    rgb: np.ndarray  # (H, W, 3) uint8
-    intrinsics: np.ndarray  # (3, 3) [px]
-    truth: np.ndarray  # (4, 4)
-    mask: np.ndarray  # (H, W) bool
-
-
-def animate(method: PoseEstimator, trace: Trace, scene: AnimatedScene, title: str) -> bytes:
-    """Animate the filter on one image, whose trace this is.  -> a GIF."""
-    hull, K = method.object_model.hull.cpu(), scene.intrinsics
-    target = trace_outline(scene.mask)
+    rgb (H, W, 3) uint8; K (3, 3) [px]; truth (4, 4); mask (H, W) bool. -> a GIF.
+    """
+    hull, target = method.object_model.hull.cpu(), trace_outline(mask)
     if isinstance(method.space, PoseSpace):
-        target = outline_hulls(project_hulls(torch.as_tensor(scene.truth)[None], hull, K))
-    shown = Animation(scene.rgb, K, trace, method.space, hull, target, title)
+        target = outline_hulls(project_hulls(torch.as_tensor(truth)[None], hull, K))
+    shown = Animation(rgb, K, trace, method.space, hull, target, title)
     return encode_gif(list(shown.frames()))
 
 

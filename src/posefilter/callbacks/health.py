@@ -5,7 +5,7 @@ from pathlib import Path
 import torch
 from lightning import LightningModule, Trainer
 
-from posefilter.callbacks.tensorboard import Budget, post_image
+from posefilter.callbacks.tensorboard import Budget, log_numbers, post_image
 from posefilter.callbacks.trace_callback import TraceCallback
 from posefilter.figures.curves import draw_health
 from posefilter.figures.particles import choose_steps
@@ -59,8 +59,7 @@ class FilterHealth(TraceCallback):
         curves = self.curves()
         if not curves or not trainer.is_global_zero:
             return
-        for logger in trainer.loggers:
-            logger.log_metrics(name_scalars(curves, self.max_iterations), trainer.global_step)
+        log_numbers(trainer, name_scalars(curves, self.max_iterations))
         images, step = self._images, trainer.global_step
 
         def draw() -> None:

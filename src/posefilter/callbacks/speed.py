@@ -6,7 +6,7 @@ from typing import Any
 import torch
 from lightning import Callback, LightningModule, Trainer
 
-from posefilter.callbacks.tensorboard import Budget
+from posefilter.callbacks.tensorboard import Budget, log_numbers
 
 
 class Speed(Callback):
@@ -84,10 +84,7 @@ class Speed(Callback):
     def write_down(self, trainer: Trainer, numbers: dict[str, float]) -> None:
         """Hand numbers to the loggers."""
         if trainer.is_global_zero:
-            for logger in trainer.loggers:
-                logger.log_metrics(
-                    {f"speed/{name}": value for name, value in numbers.items()}, trainer.global_step
-                )
+            log_numbers(trainer, {f"speed/{name}": value for name, value in numbers.items()})
 
 
 def measure_memory(device: torch.device) -> dict[str, float]:

@@ -1,7 +1,7 @@
 """Hand figures to TensorBoard and to the run's folder, and keep count of what drawing costs."""
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from io import BytesIO
 from pathlib import Path
@@ -71,6 +71,12 @@ def post_image(
             )
     if folder is not None:
         write_whole(folder / f"{stage}_{name}{suffix}", packed)
+
+
+def log_numbers(trainer: Trainer, numbers: Mapping[str, float]) -> None:
+    """Hand numbers to the trainer's loggers."""
+    for logger in trainer.loggers:
+        logger.log_metrics(dict(numbers), trainer.global_step)
 
 
 def get_writers(trainer: Trainer) -> list[FileWriter]:

@@ -25,7 +25,7 @@ from tensorboard.plugins.hparams.plugin_data_pb2 import HParamsPluginData
 from tensorboard.plugins.hparams.summary_v2 import hparams_pb
 from torch.utils.tensorboard.summary import custom_scalars
 
-from posefilter.callbacks.tensorboard import get_boards, get_writers
+from posefilter.callbacks.tensorboard import get_boards, get_writers, log_numbers
 from posefilter.metrics.registry import find_metric
 
 Setting = bool | int | float | str
@@ -131,8 +131,7 @@ class TensorBoardLayout(Callback):
         if trainer.sanity_checking or score is None or not trainer.is_global_zero:
             return
         self._best = max(self._best, float(score))
-        for logger in trainer.loggers:
-            logger.log_metrics({BEST: self._best}, trainer.global_step)
+        log_numbers(trainer, {BEST: self._best})
 
 
 def describe_run(

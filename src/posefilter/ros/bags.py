@@ -118,9 +118,11 @@ class BagReader:
     @property
     def images(self) -> int:
         """How many color images the bag has."""
-        return sum(
-            one.msgcount for one in self.reader.connections if one.topic == self.topics.color
-        )
+        return self._count(self.topics.color)
+
+    def _count(self, topic: str) -> int:
+        """Return how many messages the bag has of a topic."""
+        return sum(one.msgcount for one in self.reader.connections if one.topic == topic)
 
     def messages(self) -> Iterator[tuple[Any, int, bytes]]:
         """Yield each message as it is stored: its connection, when it was recorded, its bytes.
@@ -213,12 +215,8 @@ class BagReader:
         """Return why not one image could be used."""
         if self.skipped:
             return f"no image could be used; the first: {self.skipped[0]}"
-        counts = dict.fromkeys(self.topics, 0)
-        for one in self.reader.connections:
-            if one.topic in counts:
-                counts[one.topic] += one.msgcount
         named = zip(Topics._fields, self.topics, strict=True)
-        empty = [f"{key}={topic}" for key, topic in named if not counts[topic]]
+        empty = [f"{key}={topic}" for key, topic in named if not self._count(topic)]
         if empty:
             return f"has no messages of {', '.join(empty)}"
         limit = f"max_time_difference={self.tolerance / 1e9:g} s"
