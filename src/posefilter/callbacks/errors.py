@@ -91,25 +91,15 @@ def measure_batch(
     if "pose" in method.capabilities:
         at_truth = method.scores["credibility"].last()
         found += [at_truth.log_density.tolist(), at_truth.rank.tolist()]
-    return make_rows(records, batch, errors, shares, scores, times, found)
+    return make_rows(records, batch, *errors, shares, scores, times, *found)
 
 
 def make_rows(
-    records: Sequence[FrameRecord],
-    batch: Batch,
-    errors: Sequence[Sequence[float]],
-    shares: Sequence[float],
-    scores: Sequence[float],
-    seconds: Sequence[float],
-    found: Sequence[Sequence[float]] = (),
+    records: Sequence[FrameRecord], batch: Batch, *columns: Sequence[float]
 ) -> list[ImageError]:
-    """Return a row an image.
-
-    errors: ADD, ADD-S and the diameters, B numbers each [mm]; found: presence, probability, and the
-    belief's log density and rank at the truth likewise, or the first of these, or nothing.
-    """
+    """Return a row an image; columns: B numbers each, of the fields from `add_mm` on."""
     seen = batch.visibility.tolist()
     return [
         ImageError(r.scene_id, r.im_id, r.obj_id, r.object, r.name, *numbers)
-        for r, *numbers in zip(records, seen, *errors, shares, scores, seconds, *found, strict=True)
+        for r, *numbers in zip(records, seen, *columns, strict=True)
     ]

@@ -209,7 +209,7 @@ def _of_estimates(job: Job) -> tuple[dict[str, Any], dict[str, Path]]:
         scores = [nan if row is None else row.score for row in estimates]
         times = [nan if row is None or row.seconds < 0 else row.seconds for row in estimates]
         own_errors = (1000 * errors.rows[-1]).T.tolist()
-        table += make_rows(own, batch, own_errors, [nan] * len(own), scores, times)
+        table += make_rows(own, batch, *own_errors, [nan] * len(own), scores, times)
         for i, index in enumerate(batch.object_id.tolist()):
             hull, K = errors.models[index].hull, batch.intrinsics[i : i + 1]
             truth = box_of_pose(batch.camera_from_object[i : i + 1], hull, K, height, width)

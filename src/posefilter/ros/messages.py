@@ -41,20 +41,17 @@ _BAYER = {
     "bayer_gbrg8": cv2.COLOR_BayerGR2RGB,
     "bayer_grbg8": cv2.COLOR_BayerGB2RGB,
 }
-_TO_RGB = {
-    "bgr8": cv2.COLOR_BGR2RGB,
-    "8UC3": cv2.COLOR_BGR2RGB,
-    "rgba8": cv2.COLOR_RGBA2RGB,
-    "bgra8": cv2.COLOR_BGRA2RGB,
-    "mono8": cv2.COLOR_GRAY2RGB,
-    "yuv422": cv2.COLOR_YUV2RGB_UYVY,
-    "yuv422_yuy2": cv2.COLOR_YUV2RGB_YUY2,
-    **_BAYER,
+_COLORS: dict[str, tuple[int, int | None]] = {  # channels, and what OpenCV makes RGB of them by
+    "rgb8": (3, None),
+    "bgr8": (3, cv2.COLOR_BGR2RGB),
+    "rgba8": (4, cv2.COLOR_RGBA2RGB),
+    "bgra8": (4, cv2.COLOR_BGRA2RGB),
+    "mono8": (1, cv2.COLOR_GRAY2RGB),
+    "8UC3": (3, cv2.COLOR_BGR2RGB),
+    "yuv422": (2, cv2.COLOR_YUV2RGB_UYVY),
+    "yuv422_yuy2": (2, cv2.COLOR_YUV2RGB_YUY2),
+    **{name: (1, code) for name, code in _BAYER.items()},
 }
-_CHANNELS = {
-    "rgb8": 3, "bgr8": 3, "rgba8": 4, "bgra8": 4, "mono8": 1, "8UC3": 3, "yuv422": 2,
-    "yuv422_yuy2": 2, **dict.fromkeys(_BAYER, 1),
-}  # fmt: skip
 _SATURATED = 65535  # what cameras write into 16 bits beyond their range
 _PNG = b"\x89PNG\r\n\x1a\n"
 _DEPTHS = {"16UC1": "u2", "mono16": "u2", "32FC1": "f4"}
@@ -85,15 +82,16 @@ def decode_color(message: Any, topic: str) -> np.ndarray:
     if hasattr(message, "format"):
         return _decode_compressed_color(message, topic)
     encoding = str(message.encoding)
-    if encoding not in _CHANNELS:
-        known = ", ".join(_CHANNELS)
+    if encoding not in _COLORS:
+        known = ", ".join(_COLORS)
         raise UserError(f"color={topic}: encoding {encoding} is not known; there are {known}")
-    rows = _read_rows(message, topic, "color", np.dtype("u1"), _CHANNELS[encoding])
-    if encoding not in _TO_RGB:
-        return np.ascontiguousarray(rows)
+    channels, code = _COLORS[encoding]
+    rows = _read_rows(message, topic, "color", np.dtype("u1"), channels)
+    if code is None:
+        return rows
     if rows.shape[1] % 2 and encoding.startswith("yuv422"):
         raise UserError(f"color={topic}: {encoding} of an odd width, {rows.shape[1]}")
-    return np.asarray(cv2.cvtColor(np.ascontiguousarray(rows), _TO_RGB[encoding]))
+    return np.asarray(cv2.cvtColor(rows, code))
 
 
 def _decode_compressed_color(message: Any, topic: str) -> np.ndarray:
