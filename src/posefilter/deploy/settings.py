@@ -179,13 +179,9 @@ def _describe_refinement(one: Any, method: PoseEstimator) -> list[dict[str, Any]
     if isinstance(one, TextureAlignment) and isinstance(method, PosePF):
         return [describe_alignment(one, method.object_model)]
     choices = (
-        "mean_shift_icp_texture_alignment",
-        "mean_shift_icp_texture",
-        "mean_shift_icp",
-        "mean_shift",
-        "rescore",
-        "none",
-    )
+        "mean_shift_icp_texture_alignment", "mean_shift_icp_texture", "mean_shift_icp",
+        "mean_shift", "rescore", "none",
+    )  # fmt: skip
     raise _refuse(one, "refine", *choices)
 
 

@@ -89,9 +89,9 @@ def format_length(length: float) -> str:
     """Return a length [m] in words: in millimeters, or in meters where these get long."""
     if length < 0.9995:
         return f"{1000 * length:.3g} mm"
-    return (
-        "missed" if math.isinf(length) else f"{length:.2f} m" if length < 100 else f"{length:.0f} m"
-    )
+    if math.isinf(length):
+        return "missed"
+    return f"{length:.2f} m" if length < 100 else f"{length:.0f} m"
 
 
 def draw_legend(

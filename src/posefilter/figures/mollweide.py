@@ -103,15 +103,7 @@ def label_map(picture: np.ndarray, taken: np.ndarray, clearance: float = 70.0) -
             gap = np.abs(taken.reshape(-1, 2) - middle) - [half, 14]
             if (gap.max(1) > clearance / 2).all():
                 place, where = (middle[0], at[1] + down), "m" + anchor[1]
-                pen.text(
-                    place,
-                    word,
-                    fill=_INK,
-                    font=letters,
-                    anchor=where,
-                    stroke_width=5,
-                    stroke_fill=PAPER,
-                )
+                pen.text(place, word, _INK, letters, where, stroke_width=5, stroke_fill=PAPER)
                 break
     return np.asarray(image)
 

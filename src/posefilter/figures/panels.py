@@ -182,17 +182,12 @@ def draw_mark(
     """
     size = size or (_REACH if shape == "ring" else 2 * _REACH / 3)
     first = np.pi / 4 if shape == "square" else 0.0
-    turn = (
-        np.linspace(0, 2 * np.pi, 33)[:-1] if shape == "ring" else first + np.arange(4) * np.pi / 2
-    )
+    turn = first + np.arange(4) * np.pi / 2
+    if shape == "ring":
+        turn = np.linspace(0, 2 * np.pi, 33)[:-1]
     length = size * 2**0.5 if shape == "square" else size
-    draw_lines(
-        picture,
-        [at + length * np.stack([np.cos(turn), np.sin(turn)], 1)],
-        color,
-        width,
-        closed=True,
-    )
+    corners = at + length * np.stack([np.cos(turn), np.sin(turn)], 1)
+    draw_lines(picture, [corners], color, width, closed=True)
 
 
 def _locate(places: np.ndarray, x: Axis, y: Axis, plot: np.ndarray) -> np.ndarray:

@@ -186,12 +186,10 @@ def list_verdict(pairs: Sequence[Pair], names: tuple[str, str]) -> list[Block]:
         ]
     else:
         words = [Text("No difference that chance would not explain", "soft"), f"({chance})."]
-    finite = [pair.change for pair in pairs if math.isfinite(pair.change)]
-    middle = (
-        f"The median change of the error from the first to the second is {median(finite):+.2g} mm."
-        if finite
-        else ""
-    )
+    finite, middle = [pair.change for pair in pairs if math.isfinite(pair.change)], ""
+    if finite:
+        change = f"{median(finite):+.2g} mm"
+        middle = f"The median change of the error from the first to the second is {change}."
     how = "Sign test over images: those whose errors differ by less than 0.05 mm do not count."
     return [Paragraph([*words, middle]), Paragraph([Text(how, "soft")])]
 
@@ -219,18 +217,8 @@ def chart_pairs(pairs: Sequence[Pair], names: tuple[str, str]) -> list[Panel]:
         return []
     least, most = (f(row.add_mm for pair in both for row in pair) for f in (min, max))
     dots = Line("an image", [pair.a.add_mm for pair in both], [pair.b.add_mm for pair in both])
-    return [
-        Panel(
-            title=f"ADD of {names[1]}",
-            xlabel=f"ADD of {names[0]} [mm]",
-            unit="mm",
-            lines=[dots],
-            joined=False,
-            log_x=True,
-            log_y=True,
-            diagonal=(least, most),
-        )
-    ]
+    title, side, ends = f"ADD of {names[1]}", f"ADD of {names[0]} [mm]", (least, most)
+    return [Panel(title, side, "mm", [dots], joined=False, log_x=True, log_y=True, diagonal=ends)]
 
 
 def list_changes_of_images(pairs: Sequence[Pair], names: tuple[str, str]) -> list[Block]:

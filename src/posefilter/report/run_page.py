@@ -110,15 +110,10 @@ def list_diagnostics(run: Run) -> list[Block]:
     rows: list[list[Cell]] = []
     for one, value, is_bad in found:
         side = "above" if one.info.direction < 0 else "below"
-        rows.append(
-            [
-                Text("✗ yes", "bad") if is_bad else Text("✓ no", "good"),
-                one.info.label,
-                one.info.describe(value),
-                Text(f"bad {side} {one.info.describe(one.limit)}", "soft"),
-                one.meaning if is_bad else Text(one.meaning, "soft"),
-            ]
-        )
+        limit = Text(f"bad {side} {one.info.describe(one.limit)}", "soft")
+        there = Text("✗ yes", "bad") if is_bad else Text("✓ no", "good")
+        meaning = one.meaning if is_bad else Text(one.meaning, "soft")
+        rows.append([there, one.info.label, one.info.describe(value), limit, meaning])
     head = ("there?", "measured", "value", "", "it would mean")
     return [Paragraph([say]), Table(head, rows, numeric=(2, 3), form="signs")]
 

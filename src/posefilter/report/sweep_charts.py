@@ -29,22 +29,13 @@ def chart_over(
     low = min(spots.values())
     log_x = numeric and low > 0 and max(spots.values()) / low >= 8
     ticks, categories = tuple(spots.values()), () if numeric else [str(v) for v in values]
+    name = name_axis(axis, sweep)
     out = []
     for info in infos:
         lines = [line_over(axis, spots, found, info, kind) for kind in kinds]
         if shown := [line for line in lines if len(line.x)]:
-            out.append(
-                Panel(
-                    info.label,
-                    name_axis(axis, sweep),
-                    info.unit,
-                    shown,
-                    info.limits,
-                    categories,
-                    log_x,
-                    ticks=ticks,
-                )
-            )
+            own = (info.label, name, info.unit, shown, info.limits, categories, log_x)
+            out.append(Panel(*own, ticks=ticks))
     return out
 
 
