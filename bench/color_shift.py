@@ -127,15 +127,8 @@ def main() -> int:
     split = trained["split"] if same else {"test": 1.0}
     kept = ("image_width", "image_height", *(["min_visibility_test"] if same else []))
     size = {key: trained[key] for key in kept if key in trained}
-    data = PoseDataModule(
-        options.source,
-        options.root,
-        method.object_model.name,
-        options.meshes,
-        split=split,
-        limit_test=options.images,
-        **size,
-    )
+    where = (options.source, options.root, method.object_model.name, options.meshes)
+    data = PoseDataModule(*where, split=split, limit_test=options.images, **size)
     data.setup("test")
     results = {}
     for name, recolor in shifts().items():

@@ -27,12 +27,8 @@ class Shift:
         """Return the sample with depth from so many pixels away."""
         angle = rng.uniform(0, 2 * np.pi)
         move = self.pixels * np.array([np.cos(angle), np.sin(angle)])
-        depth = cv2.warpAffine(
-            sample.depth,
-            np.column_stack([np.eye(2), move]),
-            sample.depth.shape[::-1],
-            flags=cv2.INTER_NEAREST,
-        )
+        shift, size = np.column_stack([np.eye(2), move]), sample.depth.shape[::-1]
+        depth = cv2.warpAffine(sample.depth, shift, size, flags=cv2.INTER_NEAREST)
         return dataclasses.replace(sample, depth=depth)
 
 

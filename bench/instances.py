@@ -34,7 +34,7 @@ from posefilter.data.readers.base import BaseReader
 from posefilter.data.readers.registry import open_meshes, open_reader
 from posefilter.figures.canvas import save_image
 from posefilter.figures.detections import Drawn, draw_detections
-from posefilter.metrics.bop_results import PoseRow, to_native, write_poses_csv
+from posefilter.metrics.bop_results import PoseRow, choose_score, to_native, write_poses_csv
 from posefilter.metrics.errors import add_up_to_symmetry
 from posefilter.metrics.matching import match_greedily
 from posefilter.weights import list_shipped
@@ -106,17 +106,11 @@ def list_lines(
     results: list[Any], record: FrameRecord, reader: BaseReader, seconds: float
 ) -> list[PoseRow]:
     """Return the results of a frame in BOP's format."""
-    native = reader.native_from_mesh(record.object)
+    native, ids = reader.native_from_mesh(record.object), (record.scene_id, record.im_id)
+    scores = [choose_score(one.probability, one.score) for one in results]
     return [
-        PoseRow(
-            record.scene_id,
-            record.im_id,
-            record.obj_id,
-            one.score if one.probability is None else one.probability,
-            to_native(one.pose, native),
-            seconds,
-        )
-        for one in results
+        PoseRow(*ids, record.obj_id, score, to_native(one.pose, native), seconds)
+        for one, score in zip(results, scores, strict=True)
     ]
 
 

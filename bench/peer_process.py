@@ -35,21 +35,11 @@ class Peer:
 
     def __init__(self, program: str, python: str = sys.executable, threads: int = 1) -> None:
         self.name = program
-        count = str(threads)
-        env = os.environ | {
-            "OMP_NUM_THREADS": count,
-            "OPENBLAS_NUM_THREADS": count,
-            "NUMBA_NUM_THREADS": count,
-            "PYTHONPATH": str(SOURCES),
-        }
+        limits = (f"{library}_NUM_THREADS" for library in ("OMP", "OPENBLAS", "NUMBA"))
+        env = os.environ | dict.fromkeys(limits, str(threads)) | {"PYTHONPATH": str(SOURCES)}
         try:
-            self._process = subprocess.Popen(
-                [python, "-W", "ignore", str(HERE / program)],
-                stdin=subprocess.PIPE,
-                stdout=subprocess.PIPE,
-                env=env,
-                text=True,
-            )
+            words, pipe = [python, "-W", "ignore", str(HERE / program)], subprocess.PIPE
+            self._process = subprocess.Popen(words, stdin=pipe, stdout=pipe, env=env, text=True)
         except OSError as error:
             raise PeerError(f"{program}: {python} cannot be run: {error}") from error
         self.about: dict[str, Any] = self._read()

@@ -95,9 +95,12 @@ class Outcome(NamedTuple):
 
 
 def judge(
-    results: Sequence[Any], frames: Sequence[VideoFrame], seconds: Sequence[float]
+    found: tuple[Sequence[Any], Sequence[float]], frames: Sequence[VideoFrame], first: int = 0
 ) -> Outcome:
-    """Return the figures of results, a frame each; what is lost counts as missed."""
+    """Return the figures of results, a frame each, and their seconds from the `first` on; what is
+    lost counts as missed.
+    """
+    results, seconds = found
     object_model = results[0].object_model
     poses = torch.from_numpy(np.stack([one.pose for one in results]))
     truth = torch.from_numpy(np.stack([frame.truth[object_model.name] for frame in frames]))
@@ -105,7 +108,7 @@ def judge(
     errors = [f(poses, truth, object_model.points.double()) for f in (add, add_s)]
     areas = [auc(torch.where(missed, math.inf, error)) for error in errors]
     jitter = measure_jitter(poses, truth, object_model.center.double())
-    return Outcome(areas[0], areas[1], jitter, int(missed.sum()), float(np.median(seconds)))
+    return Outcome(areas[0], areas[1], jitter, int(missed.sum()), float(np.median(seconds[first:])))
 
 
 def run_single(
@@ -206,10 +209,9 @@ def compare(
     alone = [run_single(estimator, frames, seed) for seed in range(min(seeds, SINGLE_SEEDS))]
     for stride in strides:
         some = frames[::stride]
-        single = [judge(found[::stride], some, times[::stride]) for found, times in alone]
+        single = [judge((found[::stride], times[::stride]), some) for found, times in alone]
         tracked = [
-            judge(*_with(some, run_tracked(estimator, some, seed=seed), first=1))
-            for seed in range(seeds)
+            judge(run_tracked(estimator, some, seed=seed), some, first=1) for seed in range(seeds)
         ]
         yield make_row(name, scene, stride, single, tracked, len(some))
 
@@ -255,8 +257,7 @@ def measure_sequence(
     after = [n for n in shown if n > max(covered, default=len(frames))]
     own = [frames[n] for n in shown]
     single = [
-        judge(*_with(own, run_single(estimator, own, seed)))
-        for seed in range(min(seeds, SINGLE_SEEDS))
+        judge(run_single(estimator, own, seed), own) for seed in range(min(seeds, SINGLE_SEEDS))
     ]
     fixed = posefilter.TrackerSettings(motion=RANDOM_WALK)
     tracks, others = (
@@ -264,7 +265,7 @@ def measure_sequence(
         for settings in (None, fixed)
     )
     scores, walks = (
-        [judge([one[n] for n in shown], own, [0.0]) for one in results]
+        [judge(([one[n] for n in shown], [0.0]), own) for one in results]
         for results in (tracks, others)
     )
     truth = torch.from_numpy(np.stack([frame.truth[name] for frame in own]))
@@ -286,12 +287,6 @@ def measure_sequence(
     cells += [f"{np.mean([one.lost for one in scores]):.1f}"]
     cells += [f"{np.mean([sum(one[n].is_tracked for n in covered) for one in tracks]):.1f}"]
     return format_row([*cells, describe_recovery(back)])
-
-
-def _with(
-    frames: Sequence[VideoFrame], found: tuple[list[Any], list[float]], first: int = 0
-) -> tuple[list[Any], Sequence[VideoFrame], list[float]]:
-    return found[0], frames, found[1][first:]
 
 
 def _error(result: Any, frame: VideoFrame) -> float:
@@ -341,7 +336,7 @@ def measure_together(
             shown = [n for n, frame in enumerate(frames) if name in frame.truth]
             if shown:
                 own = [answers[way][n][k] for n in shown]
-                scored = judge(own, [frames[n] for n in shown], [0.0])
+                scored = judge((own, [0.0]), [frames[n] for n in shown])
                 scores.append(scored.add)
                 lost += scored.lost
         cells = [scene, str(len(names)), str(len(names) - len(present)), str(len(frames)), title]
@@ -507,13 +502,8 @@ def main() -> None:
     if options.sequences:
         run_sequences(options.sequences, options.meshes, options.seeds)
         return
-    reader = open_reader(
-        "ycb_video",
-        options.frames,
-        names,
-        open_meshes(options.meshes, None, "ycb_video", names),
-        subsets=["data"],
-    )
+    meshes = open_meshes(options.meshes, None, "ycb_video", names)
+    reader = open_reader("ycb_video", options.frames, names, meshes, subsets=["data"])
     scenes = list_scenes(reader)
     if options.beliefs:
         there = [(scene, SceneVideo(reader, scene, names).objects or ()) for scene in scenes]
