@@ -112,13 +112,9 @@ def _describe_zoom(own: ParticleFilter) -> dict[str, Any] | None:
         return None
     return {
         "diameter": own.zoom_diameter,  # [widths of the image]
-        "least": LEAST_ZOOM,
-        "most": MOST_ZOOM,
-        "steps": min(STEPS, own.steps),
-        "heaviest": HEAVIEST,
-        "agreed": AGREED,
-        "least_depth": LEAST_DEPTH,
-    }
+        "least": LEAST_ZOOM, "most": MOST_ZOOM, "steps": min(STEPS, own.steps),
+        "heaviest": HEAVIEST, "agreed": AGREED, "least_depth": LEAST_DEPTH,
+    }  # fmt: skip
 
 
 def _describe_start(start: Any) -> dict[str, Any]:
@@ -141,18 +137,10 @@ def _describe_move(move: Any, method: PoseEstimator) -> list[dict[str, Any]]:
     if isinstance(method, PosePF) and (half or isinstance(move, propagate.AxisRotations)):
         any_angle = getattr(move, "uniform_angle_probability", 0.0)
         axes = [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
-        axes = axes if half else method.space.axes.tolist()
-        return [
-            {
-                "kind": "turns",
-                "probability": move.probability,
-                "uniform_angle_probability": any_angle,
-                "axes": axes,
-            }
-        ]
-    raise _refuse(
-        move, "propagate", "gaussian", "gaussian_and_axis_rotations", "learned", "identity"
-    )
+        own = {"probability": move.probability, "uniform_angle_probability": any_angle}
+        return [{"kind": "turns", **own, "axes": axes if half else method.space.axes.tolist()}]
+    choices = ("gaussian", "gaussian_and_axis_rotations", "learned", "identity")
+    raise _refuse(move, "propagate", *choices)
 
 
 def _describe_estimate(one: Any) -> dict[str, Any]:

@@ -92,9 +92,8 @@ def choose_ticks(
 ) -> tuple[float, ...]:
     """Return round numbers, evenly spaced, within bounds."""
     ticks: tuple[float, ...] = ()
-    for count in range(
-        max_ticks, 2 * max_ticks + 1
-    ):  # closer ones where few would fall within the bounds
+    # closer ones where few would fall within the bounds
+    for count in range(max_ticks, 2 * max_ticks + 1):
         rough = (high - low) / count
         power = 10.0 ** np.floor(np.log10(rough))
         step = next(m * power for m in (1, 2, 2.5, 5, 10) if m * power >= rough * (1 - 1e-9))

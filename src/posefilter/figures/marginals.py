@@ -15,14 +15,8 @@ from posefilter.geometry.rotation import log_so3
 from posefilter.types import ObjectModel
 
 TRUTH: Color = (21, 153, 71)  # darker than on photographs: these are read on white
-
-
 ESTIMATE: Color = (214, 33, 156)
-
-
 OBJECT_AXES = "xyz"
-
-
 CAMERA_AXES = ("right [mm]", "down [mm]", "away [mm]")
 _ABOUT = tuple(f"about {name} [degrees]" for name in OBJECT_AXES)
 
@@ -80,12 +74,9 @@ def draw_marginals(
     )
     moved = [draw_marginal(*one) for one in zip(translations, CAMERA_AXES, strict=True)]
     turned = [draw_marginal(*one) for one in zip(rotations, _ABOUT, strict=True)]
-    return [
-        draw_text("translation of the center", CAPTION),
-        arrange_grid(moved, 3),
-        draw_text("rotation about the object's axes", CAPTION),
-        arrange_grid(turned, 3),
-    ]
+    heads = ("translation of the center", "rotation about the object's axes")
+    above, between = (draw_text(text, CAPTION) for text in heads)
+    return [above, arrange_grid(moved, 3), between, arrange_grid(turned, 3)]
 
 
 def draw_marginal(one: Marginal, label: str) -> np.ndarray:

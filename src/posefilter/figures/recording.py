@@ -180,12 +180,8 @@ def make_faint(rr: Any, mesh: Mesh) -> Any:
     normals = np.zeros_like(mesh.vertices)
     np.add.at(normals, mesh.faces.reshape(-1), mesh.corner_normals.reshape(-1, 3))
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-9)
-    return rr.Mesh3D(
-        vertex_positions=mesh.vertices,
-        triangle_indices=mesh.faces,
-        vertex_normals=normals,
-        albedo_factor=[*_OTHER, _FAINT],
-    )
+    parts = {"vertex_positions": mesh.vertices, "triangle_indices": mesh.faces}
+    return rr.Mesh3D(**parts, vertex_normals=normals, albedo_factor=[*_OTHER, _FAINT])
 
 
 def describe(shown: ViewData) -> str:
@@ -229,14 +225,10 @@ def _layout(shown: ViewData) -> Any:
     pose = shown.estimate.pose
     target = pose[:3, :3] @ shown.center + pose[:3, 3]
     aside = np.array([-0.3, -0.25, -0.6]) * np.linalg.norm(target)
-    space = rrb.Spatial3DView(
-        origin="/",
-        contents=["+ /**", "- /photograph/**", "+ /photograph", "- /filter/**", "- /about"],
-        name="Depth cloud, particles and modes",
-        eye_controls=rrb.EyeControls3D(
-            position=target + aside, look_target=target, eye_up=[0, -1, 0]
-        ),
-    )
+    eye = rrb.EyeControls3D(position=target + aside, look_target=target, eye_up=[0, -1, 0])
+    contents = ["+ /**", "- /photograph/**", "+ /photograph", "- /filter/**", "- /about"]
+    name = "Depth cloud, particles and modes"
+    space = rrb.Spatial3DView(origin="/", contents=contents, name=name, eye_controls=eye)
     height, width = shown.rgb.shape[:2]
     bounds = rrb.VisualBounds2D(x_range=[0, width], y_range=[0, height])
     image = rrb.Spatial2DView(

@@ -29,15 +29,9 @@ def label_pixels(points: Tensor, pose: Tensor, object_model: ObjectModel) -> Ten
     Returns:
         (M,) index of the part, -1 where all are farther than a tenth of the diameter.
     """
-    local = transform(invert(pose), points)
-    distance = torch.stack(
-        [
-            torch.cdist(local, part.to(local)).amin(1)
-            for part in (object_model.parts or {}).values()
-        ],
-        dim=1,
-    )
-    nearest = distance.min(1)
+    local, parts = transform(invert(pose), points), (object_model.parts or {}).values()
+    distance = [torch.cdist(local, part.to(local)).amin(1) for part in parts]
+    nearest = torch.stack(distance, dim=1).min(1)
     return torch.where(nearest.values < _REACH * object_model.diameter, nearest.indices, -1)
 
 

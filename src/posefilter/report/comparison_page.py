@@ -164,14 +164,12 @@ def name_runs(a: Run, b: Run) -> tuple[str, str]:
 def make_tiles(pairs: Sequence[Pair], names: tuple[str, str]) -> list[Tile]:
     """Return the main numbers."""
     verdict = judge(pairs)
-    return [
-        Tile(str(len(pairs)), "", "common images"),
-        *(
-            Tile(str(count), "", f"{name} is nearer")
-            for count, name in zip(verdict[:2], names, strict=True)
-        ),
-        Tile(str(verdict.equal), "", "alike"),
+    nearer = [
+        Tile(str(count), "", f"{name} is nearer")
+        for count, name in zip(verdict[:2], names, strict=True)
     ]
+    both, alike = Tile(str(len(pairs)), "", "common images"), Tile(str(verdict.equal), "", "alike")
+    return [both, *nearer, alike]
 
 
 def list_verdict(pairs: Sequence[Pair], names: tuple[str, str]) -> list[Block]:

@@ -119,14 +119,11 @@ def tabulate_groups(
     sweep: Sweep, found: Sequence[Group], infos: Sequence[MetricInfo]
 ) -> list[Block]:
     """Return a row a setting: means, with the standard deviation over seeds."""
-    rows: list[list[Cell]] = [
-        [
-            *(Text(str(group.place[axis]), "code") for axis in sweep.shown),
-            str(len(group.jobs)),
-            *(format_mean(group.of(info.key), info) for info in infos),
-        ]
-        for group in found
-    ]
+    rows = list[list[Cell]]()
+    for group in found:
+        place = [Text(str(group.place[axis]), "code") for axis in sweep.shown]
+        numbers = [format_mean(group.of(info.key), info) for info in infos]
+        rows.append([*place, str(len(group.jobs)), *numbers])
     head = [*sweep.shown, "runs", *(info.title for info in infos)]
     several = "Where there are several seeds: mean ± standard deviation of the sample."
     numeric = range(len(sweep.shown), len(head))
@@ -156,14 +153,10 @@ def tabulate_seeds(found: Sequence[Group], infos: Sequence[MetricInfo]) -> list[
     several = [group for group in found if len(group.jobs) > 1]
     if not several and len(found) > 1 and list(found[0].place) == ["seed"]:
         several = [Group({}, [job for group in found for job in group.jobs])]
-    rows: list[list[Cell]] = [
-        [
-            Text(spell(group.place) or "all", "code"),
-            str(len(group.jobs)),
-            *(format_spread(group.of(info.key), info) for info in shown),
-        ]
-        for group in several
-    ]
+    rows = list[list[Cell]]()
+    for group in several:
+        spreads = [format_spread(group.of(info.key), info) for info in shown]
+        rows.append([Text(spell(group.place) or "all", "code"), str(len(group.jobs)), *spreads])
     head = ("setting", "runs", *(info.title for info in shown))
     return [Table(head, rows, numeric=range(1, len(head)), form="sweep")]
 
@@ -190,16 +183,12 @@ def show_best(winner: Job, best: Run | None, changed: Sequence[Change] | None) -
 
 def list_jobs(sweep: Sweep, infos: Sequence[MetricInfo]) -> list[Block]:
     """Return every run, folded away."""
-    rows: list[list[Cell]] = [
-        [
-            *(Text(str(job.place[axis]), "code") for axis in sweep.axes),
-            *(
-                info.format(job.numbers[info.key]) if info.key in job.numbers else "–"
-                for info in infos
-            ),
-        ]
-        for job in sweep.jobs
-    ]
+    rows = list[list[Cell]]()
+    for job in sweep.jobs:
+        place = [Text(str(job.place[axis]), "code") for axis in sweep.axes]
+        known = job.numbers
+        numbers = [info.format(known[info.key]) if info.key in known else "–" for info in infos]
+        rows.append([*place, *numbers])
     head = [*sweep.axes, *(info.title for info in infos)]
     table = Table(head, rows, range(len(sweep.axes), len(head)), form="sweep")
     return [Fold(f"All {len(rows)} runs", [table])]
