@@ -101,27 +101,25 @@ def make_graphs(method: PoseEstimator, width: int, height: int) -> Graphs:
     method = method.cpu().eval()
     with torch.no_grad():
         if isinstance(method, PosePF):
-            encode = EncodeForPoses(method, resize).eval()
-            encoding = encode(*image)[:5]
+            encode: nn.Module = EncodeForPoses(method, resize)
+            measure: nn.Module = ScorePoses(method, resize.after)
             poses = torch.eye(4).repeat(3, 1, 1)
             poses[:, 2, 3] = 1.0
             points = torch.export.Dim("points", min=1)
-            inputs: tuple[Any, ...] = (poses, torch.tensor(0.01), torch.zeros(5, 2), *encoding)
+            found = encode.eval()(*image)[:5]
+            inputs: tuple[Any, ...] = (poses, torch.tensor(0.01), torch.zeros(5, 2), *found)
             dynamic: tuple[Any, ...] = ({0: count}, None, {0: points}, *[None] * 5)
-            measure: nn.Module = ScorePoses(method, resize.after)
-            measured = Graph(measure.eval(), inputs, dynamic)
-            return Graphs(Graph(encode, image, None), measured, resize.after)
-        assert isinstance(method, ImageSpace)
-        strides, drawn = _find_strides(method, resize, image)
-        encode_pixels = EncodeForPixels(method, resize, len(strides), drawn).eval()
-        found = encode_pixels(*image)
-        levels = found[3 : 3 + len(strides)]
-        state, latent = torch.zeros(3, 2), torch.zeros(3, method.latent_width)
-        dynamic = ({0: count}, {0: count}, None, None, None, tuple(None for _ in levels))
-        inputs = (state, latent, *found[:3], levels)
-        measure = MeasurePixels(method, strides).eval()
-    measured = Graph(measure, inputs, dynamic)
-    return Graphs(Graph(encode_pixels, image, None), measured, resize.after)
+        else:
+            assert isinstance(method, ImageSpace)
+            strides, drawn = _find_strides(method, resize, image)
+            encode = EncodeForPixels(method, resize, len(strides), drawn)
+            measure = MeasurePixels(method, strides)
+            found = encode.eval()(*image)
+            levels = found[3 : 3 + len(strides)]
+            state, latent = torch.zeros(3, 2), torch.zeros(3, method.latent_width)
+            inputs = (state, latent, *found[:3], levels)
+            dynamic = ({0: count}, {0: count}, None, None, None, tuple(None for _ in levels))
+    return Graphs(Graph(encode, image, None), Graph(measure.eval(), inputs, dynamic), resize.after)
 
 
 def _find_strides(

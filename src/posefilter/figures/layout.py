@@ -23,7 +23,7 @@ _SWATCH = 26  # [px] the line of color before a legend's word
 
 
 def tile_width(columns: int) -> int:
-    """Return how wide tiles are, so many of which, laid out by `grid`, fill a figure [px]."""
+    """Return how wide tiles are [px], of which `arrange_grid` needs so many to fill a figure."""
     return (WIDTH - GAP) // columns - GAP
 
 

@@ -2,7 +2,7 @@
 than a plotting library.
 
 Round a panel's plot are margins for the ticks and the labels; what it shows is said above it
-(`headed`).
+(`add_caption`).
 """
 
 from collections.abc import Sequence

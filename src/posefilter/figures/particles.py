@@ -74,7 +74,7 @@ def draw_particles_on(
     view: View,
     axes: np.ndarray | None = None,
 ) -> np.ndarray:
-    """Draw the same on a `ground` that is there already.
+    """Draw the same on a background that is there already.
 
     axes (M, 4, 2) [px]: center and the ends of x, y and z of the poses whose axes are drawn.
     """
@@ -212,7 +212,7 @@ class PoseStep:
         return np.stack([middle - 0.7 * self.half_side, middle + 0.7 * self.half_side])
 
     def draw(self, below: np.ndarray, view: View) -> np.ndarray:
-        """Draw it on a view's `ground`."""
+        """Draw it on a view's background."""
         return draw_particles_on(below, self.pixels, self.weights, view, self.axes)
 
 

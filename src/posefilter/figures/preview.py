@@ -37,7 +37,7 @@ def draw_preview(reader: BaseReader, name: str, frames: int, count: int = 4) -> 
     tiles = [draw_frame(sample, name, float(near), float(far)) for name, sample in found]
     if len(tiles) == 1:  # the rows above and below need the width of two
         tiles.append(np.full_like(tiles[0], 255))
-    figure = arrange_grid([tiles[0], *tiles[1:]], len(tiles))
+    figure = arrange_grid(tiles, len(tiles))
     title = f"{name}: {len(found)} of {frames} frames"
     head = draw_row(figure.shape[1], title, [("visible part", TRUTH)], size=18)
     return np.concatenate(
