@@ -17,6 +17,7 @@ import omegaconf._utils
 import torch
 import yaml
 from forked import end_with
+from programs import HOME
 
 # what the commands import when they are called: before the fork, so that it is paid once
 import posefilter.cli.calibrate
@@ -32,7 +33,6 @@ import posefilter.cli.track
 import posefilter.cli.train  # noqa: F401
 from posefilter.cli.command import run_command
 
-HOME = Path(__file__).parents[1]
 RAW = 70  # exit status of a process whose command ended in a traceback
 _WARM: set[tuple[str, ...]] = set()  # what was run in this process
 

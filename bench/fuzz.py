@@ -28,18 +28,15 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from forking import RAW, Ended, prepare, run, warm
 from lightning import Trainer
 from omegaconf import OmegaConf
+from programs import HOME
 
-HOME = Path(__file__).parents[1]
-sys.path.insert(0, str(HOME / "bench"))
-
-from forking import RAW, Ended, prepare, run, warm  # noqa: E402
-
-import posefilter.cli.onboard  # noqa: E402
-from posefilter.cli.command import compose_job  # noqa: E402
-from posefilter.ranges import list_nodes  # noqa: E402
-from posefilter.ros.messages import CAMERA_INFO, IMAGE, make_message, open_types  # noqa: E402
+import posefilter.cli.onboard
+from posefilter.cli.command import compose_job
+from posefilter.ranges import list_nodes
+from posefilter.ros.messages import CAMERA_INFO, IMAGE, make_message, open_types
 
 SECONDS, PATIENCE, MEMORY = 20, 300, 12 << 30  # of one line: processor [s], clock [s], [bytes]
 ACCEPTED, REFUSED, USAGE = "accepted", "refused in one line", "refused with Hydra's usage"

@@ -26,12 +26,8 @@ from pathlib import Path
 from typing import Any
 
 import torch
-
-HOME = Path(__file__).parents[1]
-sys.path.insert(0, str(HOME / "bench"))
-
-from forking import Ended, prepare, start, wait, warm  # noqa: E402
-from kills import SMALL, TIMES, follow, list_differing, make_data  # noqa: E402
+from forking import Ended, prepare, start, wait, warm
+from kills import SMALL, TIMES, follow, list_differing, make_data
 
 VARY = "filter.particles=8,4"
 _AGAIN = (".hydra", "train.log")  # of a job that is done: written by Hydra at each start

@@ -31,11 +31,8 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import torch
-
-HOME = Path(__file__).parents[1]
-sys.path.insert(0, str(HOME / "bench"))
-
-from forking import prepare, run, start, wait, warm  # noqa: E402
+from forking import prepare, run, start, wait, warm
+from programs import HOME
 
 MODELS = ("pose_pf", "patch_pf", "pixel_pf", "cnn_patch", "downsized")
 SMALL = (

@@ -47,13 +47,10 @@ from pathlib import Path
 from types import CodeType, ModuleType
 
 import pytest
-
-HOME = Path(__file__).parents[1]
-sys.path.insert(0, str(HOME / "bench"))
-
-from changing import Mutant, graft, list_mutants  # noqa: E402
-from forked import leave, wait  # noqa: E402
-from reached import QUIET, Place, Reach, find_reach, forget  # noqa: E402
+from changing import Mutant, graft, list_mutants
+from forked import leave, wait
+from programs import HOME
+from reached import QUIET, Place, Reach, find_reach, forget
 
 PACKAGES = ("metrics", "geometry", "filters", "losses")
 TESTS = (
