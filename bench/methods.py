@@ -88,10 +88,7 @@ def plan(meshes: str | None = None, frames: str | None = None) -> list[Line]:
             "filter.steps=3,10 seed=0,1,2",
         ),
     ]
-    lines += [
-        ablation("resampling", "filter/resample=none,systematic,auxiliary", MEMORISED, model)
-        for model in MODELS
-    ]
+    lines += vary_filter("resampling", "filter/resample=none,systematic,auxiliary", MEMORISED)
     lines += [
         Line(
             "ablation_detect", f"model={m} experiment=memorize sweep=ablation_detect seed=0", into=m
@@ -99,16 +96,10 @@ def plan(meshes: str | None = None, frames: str | None = None) -> list[Line]:
         for m in DETECTORS
     ]
     lines += [Line("held_out", f"{FOUR} seed=0"), Line("held_out", POSE)]  # pose_pf beside them
-    lines += [
-        ablation("particles", "filter.particles=10,20,50,100,300,1000", HELD_OUT, model)
-        for model in MODELS
-    ]
-    lines += [
-        ablation("iterations", "filter.steps=1,2,3,5,10,30,100", HELD_OUT, model)
-        for model in MODELS
-    ]
+    lines += vary_filter("particles", "filter.particles=10,20,50,100,300,1000", HELD_OUT)
+    lines += vary_filter("iterations", "filter.steps=1,2,3,5,10,30,100", HELD_OUT)
     noise = "filter/propagate=learned,learned_and_gaussian filter.steps=10,100"
-    lines += [ablation("noise", noise, HELD_OUT, model) for model in WITH_POSE]
+    lines += vary_filter("noise", noise, HELD_OUT, WITH_POSE)
     lines += [
         Line("ablation", f"model={m} experiment=memorize sweep=ablation seed=0", into=m)
         for m in WITH_POSE
@@ -158,15 +149,14 @@ def plan(meshes: str | None = None, frames: str | None = None) -> list[Line]:
             "model=patch_pf "
             "ablation=m9_context,pose_m17_fragments,m11_muon,m5_displacement_loss seed=0",
         ),
-        ablation("held_out_less", "filter/resample=none", HELD_OUT, "patch_pf"),
+        *vary_filter("held_out_less", "filter/resample=none", HELD_OUT, ("patch_pf",)),
         Line("patch", "model=patch_pf experiment=memorize sweep=patch seed=0"),
     ]
     lines += [*list_pose_space(), *list_paper(), *list_choices(), *list_long()]
     lines += list_units_at_full_size()
     if meshes:
-        lines += [
-            Line("cracker_box", f"{FOUR} experiment=cracker_box_pixels data.meshes={meshes} seed=0")
-        ]
+        box = f"{FOUR} experiment=cracker_box_pixels data.meshes={meshes} seed=0"
+        lines.append(Line("cracker_box", box))
     if meshes and frames:
         real = f"data=ycb_video data.root={frames} data.meshes={meshes}"
         runs = {
@@ -226,11 +216,9 @@ def list_units() -> list[Line]:
         )
     )
     for model in ("patch_pf", "downsized", "cnn_patch"):
-        size = (
-            "sweep=ablation_detect filter.particles=8 model.net.width=16"
-            if model in DETECTORS
-            else "sweep=ablation"
-        )
+        size = "sweep=ablation"
+        if model in DETECTORS:
+            size = "sweep=ablation_detect filter.particles=8 model.net.width=16"
         lines.append(Line("unit", f"model={model} {paper} {size} {UNITS} seed=0,1,2"))
     return lines
 
@@ -386,9 +374,9 @@ def list_long() -> list[Line]:
     ]
 
 
-def ablation(table: str, swept: str, run: str, model: str) -> Line:
-    """Return a sweep at test time over choices of the filter, on a method's run."""
-    return Line(table, swept, run.format(model), model)
+def vary_filter(table: str, swept: str, run: str, models: Sequence[str] = MODELS) -> list[Line]:
+    """Return sweeps at test time over choices of the filter, on methods' runs."""
+    return [Line(table, swept, run.format(model), model) for model in models]
 
 
 def command(line: Line, root: Path, more: Sequence[str] = ()) -> list[str]:
@@ -420,14 +408,9 @@ def waits(line: Line, root: Path) -> bool:
     if line.of != str(checkpoint) and not (checkpoint.parents[1] / "metrics.json").is_file():
         return True
     made = checkpoint.stat().st_mtime
-    done = [
-        path
-        for path in (root / line.table / line.into).glob("*/metrics.json")
-        if path.stat().st_mtime > made
-    ]
-    return len(done) >= math.prod(
-        len(word.split("=", 1)[1].split(",")) for word in line.words.split()
-    )
+    found = (root / line.table / line.into).glob("*/metrics.json")
+    done = sum(path.stat().st_mtime > made for path in found)
+    return done >= math.prod(len(word.split("=", 1)[1].split(",")) for word in line.words.split())
 
 
 def main() -> int:

@@ -51,7 +51,8 @@ def test_every_table_of_the_plan_has_its_place_in_the_docs() -> None:
 
 
 def test_an_evaluation_waits_for_its_checkpoint_and_is_not_done_twice(tmp_path: Path) -> None:
-    line = methods.ablation("particles", "filter.particles=50,100", methods.HELD_OUT, "patch_pf")
+    swept = ("particles", "filter.particles=50,100", methods.HELD_OUT)
+    (line,) = methods.vary_filter(*swept, ("patch_pf",))
     words = methods.command(line, tmp_path)
     assert words[:2] == ["evaluate.py", "-m"]
     assert "filter.particles=50,100" in words
