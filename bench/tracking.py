@@ -154,11 +154,7 @@ def measure_loss(
     mixed = [other[n] if n in AWAY else frame for n, frame in enumerate(frames)]
     results, _ = run_tracked(estimator, mixed, seed=seed)
     said = [results[n].is_tracked for n in AWAY]
-    model, back = estimator.object_models[0], None
-    for n in range(AWAY.stop, len(frames)):
-        if results[n].is_tracked and _error(results[n], frames[n]) < 0.1 * model.diameter:
-            back = n - AWAY.stop + 1
-            break
+    back = find_recovery(results, frames, range(AWAY.stop, len(frames)))
     early = sum(said[: posefilter.TrackerSettings().patience - 1])
     there = min(r.presence for n, r in enumerate(results) if r.is_tracked and n not in AWAY)
     return sum(said), early, back, there, max(results[n].presence for n in AWAY)
@@ -225,18 +221,10 @@ def make_row(
     n: int,
 ) -> str:
     """Return a line of the table."""
-    both = [
-        text
-        for some in (single, tracked)
-        for text in (
-            average(some, "add"),
-            average(some, "add_s"),
-            *(
-                f"{np.mean([one.jitter[k] for one in some]):.{digits}f}"
-                for k, digits in ((0, 1), (1, 2))
-            ),
-        )
-    ]
+    both = list[str]()
+    for some in (single, tracked):
+        shift, turn = np.mean([one.jitter for one in some], axis=0)
+        both += [average(some, "add"), average(some, "add_s"), f"{shift:.1f}", f"{turn:.2f}"]
     lost = f"{np.mean([one.lost for one in tracked]):.2g}"
     once, again = (float(np.median([one.seconds for one in some])) for some in (single, tracked))
     cells = [name, scene, str(stride), str(n), *both, lost, f"{once:.2f}"]
@@ -270,17 +258,7 @@ def measure_sequence(
     )
     truth = torch.from_numpy(np.stack([frame.truth[name] for frame in own]))
     steps = measure_jitter(truth, torch.eye(4).double().expand_as(truth), model.center.double())
-    back = [
-        next(
-            (
-                count
-                for count, n in enumerate(after, start=1)
-                if one[n].is_tracked and _error(one[n], frames[n]) < 0.1 * model.diameter
-            ),
-            None,
-        )
-        for one in tracks
-    ]
+    back = [find_recovery(one, frames, after) for one in tracks]
     cells = [name, sequence, *(f"{x:.1f}" for x in steps), str(len(frames)), str(len(covered))]
     cells += [average(single, "add"), average(scores, "add"), average(walks, "add")]
     cells += [average(single, "add_s"), average(scores, "add_s")]
@@ -289,9 +267,18 @@ def measure_sequence(
     return format_row([*cells, describe_recovery(back)])
 
 
-def _error(result: Any, frame: VideoFrame) -> float:
-    truth = torch.from_numpy(frame.truth[result.object])[None]
-    return float(add_s(torch.from_numpy(result.pose)[None], truth, result.object_model.points))
+def find_recovery(
+    results: Sequence[Any], frames: Sequence[VideoFrame], numbers: Sequence[int]
+) -> int | None:
+    """Return in which of some frames, counted from 1, an object is found, or None."""
+    for count, n in enumerate(numbers, start=1):
+        result, model = results[n], results[n].object_model
+        if result.is_tracked:
+            truth = torch.from_numpy(frames[n].truth[result.object])[None]
+            error = float(add_s(torch.from_numpy(result.pose)[None], truth, model.points))
+            if error < 0.1 * model.diameter:
+                return count
+    return None
 
 
 def measure_together(
