@@ -29,7 +29,7 @@ import posefilter
 from posefilter.belief import Belief
 from posefilter.confidence.belief_scale import DEGREES
 from posefilter.confidence.tolerance import RIGHT, PoseTolerance, measure_pose_errors
-from posefilter.data.frames import FrameRecord, Sample
+from posefilter.data.frames import Sample
 from posefilter.data.readers.base import BaseReader
 from posefilter.data.readers.registry import open_meshes, open_reader
 from posefilter.errors import UserError
@@ -86,14 +86,19 @@ SPOILED: dict[str, Spoil] = {
 }
 
 
+def list_frames(reader: BaseReader) -> list[list[int]]:
+    """Return the records of each image."""
+    frames: dict[str, list[int]] = {}
+    for i, record in enumerate(reader.records()):
+        frames.setdefault(record.name, []).append(i)
+    return list(frames.values())
+
+
 def list_images(reader: BaseReader, every: int) -> list[list[int]]:
     """Return the records of each image, every so many images of a scene."""
-    images: dict[str, list[int]] = {}
-    for i, record in enumerate(reader.records()):
-        images.setdefault(record.name, []).append(i)
     scenes: dict[str, list[list[int]]] = {}
-    records: list[FrameRecord] = list(reader.records())
-    for own in images.values():
+    records = reader.records()
+    for own in list_frames(reader):
         scenes.setdefault(records[own[0]].group, []).append(own)
     return [own for many in scenes.values() for own in many[::every]]
 

@@ -26,7 +26,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from confidence import degrees_of, measure_error, summarize_errors
+from confidence import degrees_of, list_frames, measure_error, summarize_errors
 
 import posefilter
 from posefilter.data.frames import FrameRecord, Sample
@@ -38,14 +38,6 @@ from posefilter.metrics.bop_results import PoseRow, choose_score, to_native, wri
 from posefilter.metrics.errors import add_up_to_symmetry
 from posefilter.metrics.matching import match_greedily
 from posefilter.weights import list_shipped
-
-
-def list_frames(reader: BaseReader) -> list[list[int]]:
-    """Return the records of each image."""
-    frames: dict[str, list[int]] = {}
-    for i, record in enumerate(reader.records()):
-        frames.setdefault(record.name, []).append(i)
-    return list(frames.values())
 
 
 def take_time(call: Callable[[], Any]) -> tuple[Any, float]:
