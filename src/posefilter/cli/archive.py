@@ -5,7 +5,7 @@ and its tensors after.
 import re
 import stat
 import zipfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -42,12 +42,29 @@ def check_archive(file: Path, said: str) -> None:
     if size > _LARGEST:
         raise UserError(f"{said}: {size / 1e9:.0f} GB is more than a checkpoint has")
     try:
-        with zipfile.ZipFile(file) as archive:
-            parts = archive.infolist()
+        archive = zipfile.ZipFile(file)
     except (zipfile.BadZipFile, OSError, ValueError, NotImplementedError) as error:
         raise UserError(
             f"{said}: not readable as a checkpoint (no archive as torch writes it)"
         ) from error
+    with archive:
+        parts = archive.infolist()
+        _check_parts(parts, size, said)
+        try:  # torch looks at no checksum, and would load weights that are other numbers
+            broken = archive.testzip()
+        except (zipfile.BadZipFile, OSError, ValueError, RuntimeError, EOFError) as error:
+            raise UserError(f"{said}: not readable as a checkpoint (it is damaged)") from error
+        if broken is not None:
+            raise UserError(
+                f"{said}: is damaged: its part {broken[:60]!r} is not what was written; copy it "
+                "again"
+            )
+        for part in parts:
+            if part.filename.lower().endswith(".pkl"):
+                check_pickle(archive.read(part), said)
+
+
+def _check_parts(parts: Sequence[zipfile.ZipInfo], size: int, said: str) -> None:
     if len(parts) > _MOST_FILES:
         raise UserError(f"{said}: {len(parts)} parts are more than a checkpoint has")
     for part in parts:
@@ -67,36 +84,6 @@ def check_archive(file: Path, said: str) -> None:
         raise UserError(f"{said}: its parts claim to be larger than the file")
     if len({part.filename.lower() for part in parts}) < len(parts):  # torch's reader sees no case
         raise UserError(f"{said}: two of its parts have one name")
-    _check_whole(file, said)
-    for part in parts:
-        if part.filename.lower().endswith(".pkl"):
-            check_pickle(_read_part(file, part, said), said)
-
-
-def _check_whole(file: Path, said: str) -> None:
-    """Raise UserError where a part is not what was written, by its checksum: torch looks at none,
-    and would load weights that are other numbers.
-    """
-    try:
-        with zipfile.ZipFile(file) as archive:
-            broken = archive.testzip()
-    except (zipfile.BadZipFile, OSError, ValueError, RuntimeError, EOFError) as error:
-        raise UserError(f"{said}: not readable as a checkpoint (it is damaged)") from error
-    if broken is not None:
-        raise UserError(
-            f"{said}: is damaged: its part {broken[:60]!r} is not what was written; copy it again"
-        )
-
-
-def _read_part(file: Path, part: zipfile.ZipInfo, said: str) -> bytes:
-    try:
-        with zipfile.ZipFile(file) as archive, archive.open(part) as stream:
-            return stream.read(part.file_size)
-    # a damaged or encrypted part fails in many ways
-    except (zipfile.BadZipFile, OSError, ValueError, RuntimeError, EOFError) as error:
-        raise UserError(
-            f"{said}: not readable as a checkpoint (its part {part.filename[:60]!r} is damaged)"
-        ) from error
 
 
 def check_content(checkpoint: Any, file: Path, said: str) -> dict[str, Any]:

@@ -7,6 +7,7 @@ torch.save writes needs neither.
 
 import pickletools
 import re
+from typing import Any
 
 from posefilter.errors import UserError
 
@@ -53,7 +54,7 @@ def _find_flaw(data: bytes) -> str:
     value is made of, 1 for what cannot be a key anyway.
     """
     stack: list[int] = []
-    memo: dict[int, int] = {}
+    memo: dict[Any, int] = {}
 
     def pop_to_mark() -> list[int]:
         at = len(stack) - 1 - stack[::-1].index(_MARK)
@@ -74,9 +75,9 @@ def _find_flaw(data: bytes) -> str:
         elif name == "MARK":
             stack.append(_MARK)
         elif name in ("BINPUT", "LONG_BINPUT"):
-            memo[_whole(argument)] = stack[-1]
+            memo[argument] = stack[-1]
         elif name in ("BINGET", "LONG_BINGET"):
-            stack.append(memo[_whole(argument)])
+            stack.append(memo[argument])
         elif name == "TUPLE" or name in _TUPLES:
             items = (
                 pop_to_mark() if name == "TUPLE" else [stack.pop() for _ in range(_TUPLES[name])]
@@ -101,9 +102,3 @@ def _find_flaw(data: bytes) -> str:
         elif name not in ("PROTO", "STOP"):
             return f"{name}, which torch does not write"
     return ""
-
-
-def _whole(argument: object) -> int:
-    if not isinstance(argument, int):
-        raise TypeError(argument)
-    return argument
