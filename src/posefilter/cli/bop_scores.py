@@ -2,10 +2,10 @@
 them.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from functools import cache, partial
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
@@ -27,6 +27,7 @@ from posefilter.rendering.embree import EmbreeRenderer, render_depth
 
 _VISIBLE = 0.1  # the least visibility of a target, as the challenge has it
 Key = tuple[int, int, int]  # scene_id, im_id, obj_id
+_Item = TypeVar("_Item", FrameRecord, PoseRow)
 
 
 def assign_estimates(
@@ -181,10 +182,10 @@ def _stack_poses(
     return torch.from_numpy(truths), torch.from_numpy(stacked)
 
 
-def _group(records: Sequence[FrameRecord]) -> dict[Key, list[FrameRecord]]:
-    out: dict[Key, list[FrameRecord]] = {}
-    for record in records:
-        out.setdefault((record.scene_id, record.im_id, record.obj_id), []).append(record)
+def _group(items: Iterable[_Item]) -> dict[Key, list[_Item]]:
+    out: dict[Key, list[_Item]] = {}
+    for one in items:
+        out.setdefault((one.scene_id, one.im_id, one.obj_id), []).append(one)
     return out
 
 
@@ -192,7 +193,4 @@ def sort_rows(rows: Sequence[PoseRow]) -> dict[Key, list[PoseRow]]:
     """Return the estimates of each class in each image, the most confident first; equally
     confident ones stay in their order.
     """
-    out: dict[Key, list[PoseRow]] = {}
-    for row in sorted(rows, key=lambda row: -row.score):  # of equal ones the first counts, as BOP's
-        out.setdefault((row.scene_id, row.im_id, row.obj_id), []).append(row)
-    return out
+    return _group(sorted(rows, key=lambda row: -row.score))  # of equal ones the first, as BOP's
