@@ -3,6 +3,7 @@
 from collections.abc import Iterator, Mapping
 from typing import Any
 
+from posefilter.cli.components import chosen
 from posefilter.cli.job import Job
 from posefilter.cli.plain import to_plain
 from posefilter.report.settings import PASSING
@@ -17,13 +18,13 @@ def comparable(job: Job) -> dict[str, bool | int | float | str]:
     """Return a job's choices by group, and its settings by dotted key; a setting that repeats
     another is left out.
     """
-    chosen: dict[str, bool | int | float | str] = {
+    choices: dict[str, bool | int | float | str] = {
         group: choice
-        for group, choice in job.choices.items()
-        if group.split("/")[0] not in ("hydra", *_PASSING) and choice not in ("None", "null")
+        for group, choice in chosen(job).items()
+        if group.split("/")[0] not in _PASSING
     }
     settings = to_plain(job.cfg)
-    return chosen | dict(leaves({k: value for k, value in settings.items() if k not in _PASSING}))
+    return choices | dict(leaves({k: value for k, value in settings.items() if k not in _PASSING}))
 
 
 def differing(then: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]:

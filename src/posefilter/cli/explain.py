@@ -5,7 +5,6 @@ import re
 import shlex
 import traceback
 from pathlib import Path
-from typing import Any
 
 from hydra import compose, initialize_config_dir
 from hydra.errors import (
@@ -24,6 +23,7 @@ from posefilter.cli.instantiate import hint
 from posefilter.cli.plain import to_plain
 from posefilter.cli.renamed import rename_argument, rename_missing
 from posefilter.errors import find_reason
+from posefilter.ranges import list_nodes
 
 # settings of Lightning's Trainer, which is not imported to tell a mistake
 LIGHTNINGS = (
@@ -189,14 +189,7 @@ def compose_without(wrong: str, name: str, conf: Path, arguments: list[str]) -> 
 def known_keys(cfg: DictConfig, wrong: str) -> list[str]:
     """Return every key and group that would have been valid, nearest depth first."""
     groups = [str(k) for k in cfg.hydra.runtime.choices if not str(k).startswith("hydra/")]
-    keys: list[str] = []
-
-    def walk(node: Any, prefix: str) -> None:
-        for key, value in node.items():
-            keys.append(f"{prefix}{key}")
-            if isinstance(value, dict):
-                walk(value, f"{prefix}{key}.")
-
-    walk({k: v for k, v in to_plain(cfg).items() if k != "hydra"}, "")
+    settings = {k: v for k, v in to_plain(cfg).items() if k != "hydra"}
+    keys = [key for key, _, _ in list_nodes(settings) if "[" not in key]  # of lists, no entry
     depth = wrong.count(".")
     return sorted({*groups, *keys}, key=lambda k: (abs(k.count(".") - depth), k))

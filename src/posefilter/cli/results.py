@@ -10,7 +10,7 @@ import torch
 from posefilter.cli.console import Files, ended, finite, show_table
 from posefilter.cli.job import Job
 from posefilter.cli.machine import device_name, git_state, versions
-from posefilter.files import open_whole
+from posefilter.files import write_whole
 from posefilter.metrics.registry import find_metric, read_number
 
 _ROWS = (
@@ -63,8 +63,7 @@ def record(
 def write_json(path: Path, content: Any) -> None:
     """Write JSON that any parser reads: numbers that are none become null; whole or not at all."""
     text = json.dumps(finite(content), indent=2, allow_nan=False) + "\n"
-    with open_whole(path) as file:
-        file.write(text.encode())
+    write_whole(path, text, sync=True)
 
 
 def show(
