@@ -25,7 +25,11 @@ _FOLDERS = {
 }
 _ONE_IMAGE = "is a folder; predict takes one image, and track frames=DIR a folder of them"
 _IS_FOLDER = {"rgb": _ONE_IMAGE, "depth": _ONE_IMAGE, "estimates": "is a folder; name a file in it"}
-_SWITCHES = {"calibrate": ("overwrite",), "convert_bag": ("rectify", "track", "copy_messages")}
+_SWITCHES = {
+    "calibrate": ("overwrite",),
+    "convert_bag": ("rectify", "track", "copy_messages"),
+    "predict": ("save_rerun",),
+}
 # by the class of a logger: the package that it needs, which is an extra of ours by the same name
 _LOGGERS = {
     "lightning.pytorch.loggers.MLFlowLogger": "mlflow",
@@ -33,51 +37,56 @@ _LOGGERS = {
 }
 _SHOWN = {"sweep_folder": "sweep"}  # as it is typed
 _VIDEOS = ("mp4", "gif", "none")  # as figures/video.py writes them
-_NEEDED = {"predict": ("rgb", "depth", "intrinsics")}
+# by command: settings that must be given, and how
+_NEEDED = {
+    "convert_bag": (
+        ("bag", "out", "checkpoint"),
+        "type convert_bag in.mcap out.mcap checkpoint=...",
+    ),
+    "onboard": (("mesh",), "name an .obj, .ply or .glb file"),
+    "predict": (
+        ("rgb", "depth", "intrinsics"),
+        "predict needs rgb=, depth= and intrinsics=fx,fy,cx,cy",
+    ),
+}
 
 
 def check_files(command: str, cfg: DictConfig) -> None:
     """Check what a command is to read before torch is imported, which takes seconds.
 
-    Args:
-        command: The command's name, such as `predict`.
-        cfg: Its settings.
-
-    Raises:
-        UserError: A file or folder is missing; the message names the setting.
+    Raises UserError, naming the setting, where a file or folder is missing.
     """
+    for key in _SWITCHES.get(command, ()):
+        if not isinstance(cfg[key], bool):  # a text such as "no" would count as true
+            raise UserError(f"{key}={cfg[key]}: choose true or false")
     if command == "predict":
-        _check_rerun(cfg.save_rerun, is_several(cfg.checkpoint) or cfg.instances is not None)
+        _check_rerun(cfg)
+        _find_all(cfg.checkpoint)
     if command == "track":
         _check_video(cfg)
     if command == "train":
         _check_loggers(cfg.get("logger"))
-    for key in _SWITCHES.get(command, ()):
-        if not isinstance(cfg[key], bool):  # a text such as "no" would count as true
-            raise UserError(f"{key}={cfg[key]}: choose true or false")
-    if command == "convert_bag":
-        _check_bag(cfg)
-    if command in ("predict", "export", "calibrate") or (command == "evaluate" and cfg.checkpoint):
-        if command == "predict":
-            _find_all(cfg.checkpoint)
-        else:
-            find_weights(cfg.checkpoint)
+    if command in ("export", "calibrate") or (command == "evaluate" and cfg.checkpoint):
+        find_weights(cfg.checkpoint)
     if command in ("train", "onboard") and cfg.warm_start and not cfg.get("resume"):
         try:
             _find_all(cfg.warm_start)
         except UserError as error:
             raise UserError(str(error).replace("checkpoint=", "warm_start=")) from error
+    keys, how = _NEEDED.get(command, ((), ""))
+    for key in keys:
+        if cfg[key] is None:
+            raise UserError(f"{key}: is missing; {how}")
+    if command == "convert_bag":
+        _check_bag(cfg)
     if command == "onboard":
-        _check_mesh(cfg.mesh)
+        mesh = Path(str(cfg.mesh))
+        if not mesh.is_file() and mesh.suffix:  # a name without an ending may be a builtin one's
+            raise UserError(f"mesh={mesh}: no such file")
         more = cfg.train_overrides
         if not (isinstance(more, ListConfig) and all(isinstance(one, str) for one in more)):
             raise UserError(
                 f"train_overrides={more}: must be a list, such as ['filter.particles=200']"
-            )
-    for key in _NEEDED.get(command, ()):
-        if cfg[key] is None:
-            raise UserError(
-                f"{key}: is missing; predict needs rgb=, depth= and intrinsics=fx,fy,cx,cy"
             )
     if command == "check_data" and cfg.data.meshes is None:
         raise UserError("meshes: is missing; choose builtin, or name a folder of meshes")
@@ -98,10 +107,7 @@ def check_files(command: str, cfg: DictConfig) -> None:
 
 
 def _check_bag(cfg: DictConfig) -> None:
-    """Raise UserError where there is no bag to be read, or no place for the other."""
-    for key in ("bag", "out", "checkpoint"):
-        if cfg[key] is None:
-            raise UserError(f"{key}: is missing; type convert_bag in.mcap out.mcap checkpoint=...")
+    """Raise UserError where there is no bag to be read, or nothing that reads it."""
     if not Path(str(cfg.bag)).exists():
         raise UserError(f"bag={cfg.bag}: no such file")
     _check_on_error(cfg.on_error)
@@ -139,14 +145,6 @@ def _check_video(cfg: DictConfig) -> None:
         raise UserError("data.root: is missing; name the dataset's folder")
 
 
-def _check_mesh(mesh: Any) -> None:
-    """Raise UserError where there is no mesh; a name without an ending may be a builtin one's."""
-    if mesh is None:
-        raise UserError("mesh: is missing; name an .obj, .ply or .glb file")
-    if not Path(str(mesh)).is_file() and Path(str(mesh)).suffix:
-        raise UserError(f"mesh={mesh}: no such file")
-
-
 def _check_loggers(loggers: Any) -> None:
     """Raise UserError where a logger's package is not installed."""
     for name, node in (loggers or {}).items():
@@ -155,13 +153,11 @@ def _check_loggers(loggers: Any) -> None:
             raise missing_package(f"logger={name}", package, package)
 
 
-def _check_rerun(wanted: Any, several: bool) -> None:
+def _check_rerun(cfg: DictConfig) -> None:
     """Raise UserError where the 3-D view cannot be written."""
-    if not isinstance(wanted, bool):
-        raise UserError(f"save_rerun={wanted}: choose true or false")
-    if wanted and several:
-        raise UserError("save_rerun=true: shows one object; give one checkpoint")
-    if wanted:
+    if cfg.save_rerun:
+        if is_several(cfg.checkpoint) or cfg.instances is not None:
+            raise UserError("save_rerun=true: shows one object; give one checkpoint")
         from posefilter.figures.recording import check_viewer  # slow to import, rarely asked for
 
         check_viewer()
