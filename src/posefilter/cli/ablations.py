@@ -254,8 +254,4 @@ def list_pose_space_ablations() -> list[str]:
 def _in_order(names: list[str]) -> list[str]:
     """Move `working` between what is added to the paper and what is taken from working."""
     first = next(i for i, name in enumerate(names) if name.startswith("m"))
-    return [
-        *(n for n in names[:first] if n != "working"),
-        "working",
-        *names[first:],
-    ]
+    return [*(n for n in names[:first] if n != "working"), "working", *names[first:]]

@@ -137,12 +137,8 @@ def _check_object(model: Any, said: str) -> None:
     # checkpoints of earlier versions have none of these
     packed = isinstance(model, dict) and model.get("texture_look") is not None
     later = {"texture": (-1, 3 if packed else 9), "shape_symmetries": (-1, 4, 4)}
-    if not isinstance(model, dict) or set(model) - {"parts", "texture_look", *later} != {
-        "name",
-        "radius",
-        "diameter",
-        *shapes,
-    }:
+    needed = {"name", "radius", "diameter", *shapes}
+    if not isinstance(model, dict) or set(model) - {"parts", "texture_look", *later} != needed:
         raise UserError(
             f"{said}: its object should have name, points, center, radius, diameter, "
             f"symmetries and hull"
@@ -239,21 +235,10 @@ class Bounded(TorchFunctionMode):
         return func(*args, **kwargs)
 
 
-_FACTORIES = frozenset(
-    getattr(torch, name)
-    for name in (
-        "arange",
-        "empty",
-        "eye",
-        "full",
-        "linspace",
-        "logspace",
-        "ones",
-        "rand",
-        "randn",
-        "zeros",
-    )
-)
+_FACTORIES = {
+    *(torch.arange, torch.empty, torch.eye, torch.full, torch.linspace, torch.logspace),
+    *(torch.ones, torch.rand, torch.randn, torch.zeros),
+}
 
 
 def _sizes(node: Any) -> Iterator[int]:

@@ -16,14 +16,7 @@ from typing import Any, Literal, Union, get_args, get_origin
 
 from posefilter.cli.plain import resolve
 from posefilter.cli.renamed import rename_argument, rename_class
-from posefilter.cli.trust import (
-    Scope,
-    check_name,
-    is_component,
-    is_listed,
-    is_plugin,
-    listed_in,
-)
+from posefilter.cli.trust import Scope, check_name, is_component, is_listed, is_plugin, listed_in
 from posefilter.errors import UserError, find_reason
 
 Variant = Callable[[Any], Callable[..., Any]]

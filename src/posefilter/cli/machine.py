@@ -15,13 +15,7 @@ import torch
 from posefilter.memory import keep_freed_memory
 
 _PACKAGES = (
-    "posefilter",
-    "torch",
-    "lightning",
-    "hydra-core",
-    "torchmetrics",
-    "numpy",
-    "scipy",
+    *("posefilter", "torch", "lightning", "hydra-core", "torchmetrics", "numpy", "scipy"),
     "opencv-python-headless",
 )
 

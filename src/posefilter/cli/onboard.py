@@ -405,13 +405,7 @@ _TRAINED = ("used", "frames", "budget_minutes", "steps", "warm_start", "train_ov
 STAGES = (
     Stage("mesh", "checking the mesh", ("mesh", "name", *_DISTRACTORS), store_meshes),
     Stage("symmetries", "finding symmetries", ("mesh", "symmetries"), use_symmetries),
-    Stage(
-        "render",
-        "rendering",
-        ("mesh", "name", *_DISTRACTORS, "seed", "frames"),
-        render,
-        True,
-    ),
+    Stage("render", "rendering", ("mesh", "name", *_DISTRACTORS, "seed", "frames"), render, True),
     Stage("train", "training", ("mesh", *_TRAINED), train, True),
     Stage("export", "writing the weights", ("mesh", *_TRAINED), export),
     Stage("calibrate", "calibrating the probability", ("mesh", *_TRAINED), calibrate),

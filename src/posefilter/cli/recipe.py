@@ -21,18 +21,8 @@ from posefilter.errors import UserError
 from posefilter.paths import stays_inside
 
 NOT_KEPT = (
-    "warm_start",
-    "out",
-    "folder",
-    "trainer",
-    "callbacks",
-    "logger",
-    "resume",
-    "debug",
-    "console",
-    "plugins",
-    "tags",
-    "hydra",
+    *("warm_start", "out", "folder", "trainer", "callbacks", "logger", "resume", "debug"),
+    *("console", "plugins", "tags", "hydra"),
 )
 # settings that name files to start a training from: the checkpoint has what came of them
 PRETRAINED = ("weights",)

@@ -100,11 +100,7 @@ KEYS = {
     **{
         f"tracker.{part}.{old}": f"tracker.{now}.{new}"
         for part, now in (("follow", "follow"), ("look", "probe"), ("search", "search"))
-        for old, new in (
-            ("start", "initial_sigma"),
-            ("stop", "final_sigma"),
-            ("points", "pixels"),
-        )
+        for old, new in (("start", "initial_sigma"), ("stop", "final_sigma"), ("points", "pixels"))
     },
 }
 # settings of single commands

@@ -10,13 +10,7 @@ import numpy as np
 from posefilter.cli.console import finite
 from posefilter.errors import UserError
 from posefilter.files import GrowingFile
-from posefilter.metrics.bop_results import (
-    HEADER,
-    PoseRow,
-    choose_score,
-    format_pose_row,
-    to_native,
-)
+from posefilter.metrics.bop_results import HEADER, PoseRow, choose_score, format_pose_row, to_native
 from posefilter.tracking.records import TrackRow, describe_row, format_row
 
 POSES = "poses.csv"

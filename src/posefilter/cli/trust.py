@@ -29,27 +29,13 @@ COMPONENTS = ("filters", "labels", "losses", "models", "nets")
 # packages of posefilter whose classes the user's own settings may name as well
 _LOOKING = ("callbacks",)
 _OPTIMIZERS = (
-    "ASGD",
-    "Adadelta",
-    "Adagrad",
-    "Adam",
-    "AdamW",
-    "Adamax",
-    "NAdam",
-    "RAdam",
-    "RMSprop",
-    "Rprop",
-    "SGD",
+    *("ASGD", "Adadelta", "Adagrad", "Adam", "AdamW", "Adamax", "NAdam", "RAdam", "RMSprop"),
+    *("Rprop", "SGD"),
 )
 _LAYERS = ("ELU", "GELU", "Identity", "LeakyReLU", "Linear", "ReLU", "SiLU", "Tanh")
 _SCHEDULES = (
-    "ConstantLR",
-    "CosineAnnealingLR",
-    "ExponentialLR",
-    "LinearLR",
-    "MultiStepLR",
-    "OneCycleLR",
-    "StepLR",
+    *("ConstantLR", "CosineAnnealingLR", "ExponentialLR", "LinearLR", "MultiStepLR"),
+    *("OneCycleLR", "StepLR"),
 )
 _RECIPE_NAMES = frozenset(
     {
@@ -64,12 +50,8 @@ DATA_NAMES = frozenset(
 )
 _AUGMENTATIONS = ("posefilter.data.augmentation", "posefilter.data.photometric")
 _CALLBACKS = (
-    "DeviceStatsMonitor",
-    "EarlyStopping",
-    "LearningRateMonitor",
-    "ModelCheckpoint",
-    "ModelSummary",
-    "Timer",
+    *("DeviceStatsMonitor", "EarlyStopping", "LearningRateMonitor", "ModelCheckpoint"),
+    *("ModelSummary", "Timer"),
 )
 _LOGGERS = ("CSVLogger", "MLFlowLogger", "TensorBoardLogger", "WandbLogger")
 _PROFILERS = ("AdvancedProfiler", "PyTorchProfiler", "SimpleProfiler")
