@@ -261,29 +261,25 @@ def is_protocol(kind: type) -> bool:
 
 def describe(wanted: Any) -> str:
     """Return an annotation in words."""
-    if get_origin(wanted) in (Union, types.UnionType):
-        return " or ".join(describe(option) for option in get_args(wanted))
-    if get_origin(wanted) is Literal:
-        return "one of " + ", ".join(map(str, get_args(wanted)))
+    origin, inner = get_origin(wanted), get_args(wanted)
+    if origin in (Union, types.UnionType):
+        return " or ".join(map(describe, inner))
+    if origin is Literal:
+        return "one of " + ", ".join(map(str, inner))
     words = {
+        None: "null",
+        type(None): "null",
         int: "a whole number",
         float: "a number",
         bool: "true or false",
         str: "text",
         Path: "a path",
+        Callable: "what a _target_ builds, to be called",
+        Sequence: "a list",
+        Mapping: "a mapping such as '{key: value}'",
     }
-    if wanted in (None, type(None)):
-        return "null"
-    if wanted in words:
-        return words[wanted]
-    if get_origin(wanted) is Callable:
-        return "what a _target_ builds, to be called"
-    if get_origin(wanted) is Sequence:
-        return "a list"
-    if get_origin(wanted) is Mapping:
-        return "a mapping such as '{key: value}'"
+    if (kind := origin or wanted) in words:
+        return words[kind]
     return (
-        str(wanted).replace("typing.", "")
-        if get_origin(wanted)
-        else f"a {getattr(wanted, '__name__', wanted)}"
+        str(wanted).replace("typing.", "") if origin else f"a {getattr(wanted, '__name__', wanted)}"
     )

@@ -222,9 +222,8 @@ def _check_expansion(settings: dict[str, Any], said: str) -> None:
         count += 1
         if depth > 4 * _DEEPEST or count > 10 * _MOST_NODES:
             raise UserError(f"{said}: its recipe's settings refer to each other without end")
-        if isinstance(node, dict):
-            stack += [(depth + 1, value) for value in node.values()]
-        elif isinstance(node, list):
-            stack += [(depth + 1, value) for value in node]
+        if isinstance(node, dict | list):
+            inner = node.values() if isinstance(node, dict) else node
+            stack += [(depth + 1, value) for value in inner]
         elif isinstance(node, str):
             stack += [(depth + 1, find(settings, name)) for name in _REFERENCE.findall(node)]
