@@ -17,7 +17,7 @@ from posefilter.cli.console import JSON
 from posefilter.cli.files import WholeCheckpoints
 from posefilter.cli.instantiate import instantiate
 from posefilter.cli.job import Job
-from posefilter.cli.plain import resolve
+from posefilter.cli.plain import key_of, resolve
 from posefilter.cli.progress_bar import progress
 from posefilter.cli.stopping import Stop
 from posefilter.data.module import PoseDataModule
@@ -58,7 +58,7 @@ def _check_rendered(root: Path, settings: Mapping[str, Any], overrides: Sequence
     """Refuse scenes that are there and were rendered otherwise than is typed: they are not rendered
     anew.
     """
-    keys = {one.lstrip("+").partition("=")[0] for one in overrides}
+    keys = {*map(key_of, overrides)}
     typed = {name for name in settings if f"data.generate.{name}" in keys}
     if not typed:
         return
@@ -122,8 +122,7 @@ def build_trainer(job: Job) -> Trainer:
     for layout in callbacks:
         if isinstance(layout, TensorBoardLayout):
             layout.settings = comparable(job)
-            typed = job.overrides if job.swept else []
-            layout.swept = tuple(o.split("=", 1)[0].lstrip("+~") for o in typed)
+            layout.swept = tuple(map(key_of, job.overrides if job.swept else ()))
     callbacks.append(progress(cfg.console))
     loggers: list[Logger] = _build_all(cfg.get("logger"), "logger")
     for logger in loggers:

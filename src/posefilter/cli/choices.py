@@ -131,10 +131,13 @@ def check_preset(name: str, folders: Sequence[Path]) -> None:
         if folder.is_dir() and folder.name != "size"
         for choice in list_choices(folder)
     ]
-    raise UserError(
-        f"preset={name}: there is no such choice{hint(name, known).rstrip('?')}; there are "
-        f"{', '.join(known)}"
-    )
+    raise UserError(say_no_choice("preset", name, known))
+
+
+def say_no_choice(group: str, name: str, known: Sequence[str]) -> str:
+    """Return that a group has no choice of a name, which is the nearest, and which it has."""
+    near = hint(name, known).rstrip("?")
+    return f"{group}={name}: there is no such choice{near}; there are {', '.join(known)}"
 
 
 def config_folders(arguments: Sequence[str]) -> list[Path]:

@@ -18,9 +18,9 @@ from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 from yaml import MarkedYAMLError
 
 from posefilter.cli.arguments import quote
-from posefilter.cli.choices import config_folders, list_choices
+from posefilter.cli.choices import config_folders, list_choices, say_no_choice
 from posefilter.cli.instantiate import hint
-from posefilter.cli.plain import to_plain
+from posefilter.cli.plain import key_of, to_plain
 from posefilter.cli.renamed import rename_argument, rename_missing
 from posefilter.errors import find_reason
 from posefilter.ranges import list_nodes
@@ -63,10 +63,7 @@ def explain(error: BaseException, name: str, conf: Path, arguments: list[str]) -
         if choice in _EXTRA:
             return f"{group}={choice}: its package is missing; pip install 'posefilter[sweep]'"
         options = sorted(one for one in error.options if not one.startswith("_"))
-        return (
-            f"{group}={choice}: there is no such choice{hint(choice, options).rstrip('?')}; there "
-            f"are {', '.join(options)}"
-        )
+        return say_no_choice(group, choice, options)
     if isinstance(error, ConfigCompositionException):
         found = re.search(r"Could not override '([^']+)'", text)
         if found:
@@ -132,10 +129,10 @@ def explain_hydra(error: BaseException, conf: Path, arguments: list[str]) -> str
         chosen = [a for a in arguments if a.startswith(("hydra/launcher=", "hydra/sweeper="))]
         return f"{', '.join(chosen) or 'the sweep'}: has failed ({first_line(error)})"
     # a choice that is null or a number, and the like
-    groups = [a for a in arguments if (conf / a.partition("=")[0].lstrip("+~")).is_dir()]
+    groups = [a for a in arguments if (conf / key_of(a)).is_dir()]
     wrong = next((a for a in groups if a.partition("=")[2].lower() in ("true", "false")), None)
     if wrong is not None:
-        known = list_choices(conf / wrong.partition("=")[0].lstrip("+~"))
+        known = list_choices(conf / key_of(wrong))
         return f"{wrong}: choose {', '.join(known)}"
     return f"{', '.join(groups) or 'the settings'}: cannot be read ({first_line(error)})"
 

@@ -14,6 +14,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from posefilter.cli.comparing import HANDS
 from posefilter.cli.job import Job, check_out
+from posefilter.cli.plain import key_of
 from posefilter.cli.ranks import is_follower
 from posefilter.errors import Carrier, UserError
 from posefilter.files import remove_parts, write_whole
@@ -118,7 +119,7 @@ def deciding(overrides: list[str]) -> list[str]:
     """Return what was typed, in one order, less what says where and with how many hands a run is
     done.
     """
-    return sorted(typed for typed in overrides if typed.split("=", 1)[0].lstrip("+~") not in HANDS)
+    return sorted(typed for typed in overrides if key_of(typed) not in HANDS)
 
 
 # what an evaluation writes, the file by which it is known last; and where what a run's own test has

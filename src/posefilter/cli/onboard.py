@@ -30,7 +30,8 @@ from posefilter.cli.job import Job, write_job
 from posefilter.cli.machine import settle
 from posefilter.cli.measure_speed import Speed, measure_speed
 from posefilter.cli.onboarded_mesh import find_and_draw, find_declared, read_onboarded, write_meshes
-from posefilter.cli.report import compared
+from posefilter.cli.plain import key_of
+from posefilter.cli.report import compared, write_page
 from posefilter.cli.resume import LAST
 from posefilter.cli.reuse import step_of
 from posefilter.cli.stages import Stages
@@ -38,7 +39,6 @@ from posefilter.cli.train import build, finish, fit, test
 from posefilter.confidence.fit import FEWEST
 from posefilter.devices import choose_device
 from posefilter.errors import UserError
-from posefilter.files import write_whole
 from posefilter.forms import NUMBER, TEXT
 from posefilter.meshes.inspect_mesh import list_concerns
 from posefilter.meshes.mesh import Mesh
@@ -215,7 +215,7 @@ def onboard(job: Job) -> None:
     if cfg.train_overrides:  # a mistake in them is told before anything is written
         overrides = [*map(str, cfg.train_overrides)]
         for key in ("trainer.max_steps", "trainer.val_check_interval"):
-            if any(one.split("=", 1)[0].lstrip("+~") == key for one in overrides):
+            if key in map(key_of, overrides):
                 raise UserError(
                     f"train_overrides: {key} follows from budget_minutes; steps= sets the number"
                 )
@@ -366,10 +366,7 @@ def report(work: Onboarding) -> None:
         work.stages.seconds,
         work.out / "symmetries.png",
     )
-    folder = work.out / "report"
-    write_whole(folder / "report.html", page.render())
-    for name, png in page.files().items():
-        write_whole(folder / name, png)
+    write_page(page, work.out / "report")
 
 
 def tell(work: Onboarding) -> None:

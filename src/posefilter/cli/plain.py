@@ -31,6 +31,11 @@ def map_values(node: Any, change: Callable[[Any, str], Any], place: str = "") ->
     return change(node, place)
 
 
+def key_of(override: str) -> str:
+    """Return the setting or group that a typed override is of."""
+    return override.partition("=")[0].lstrip("+~")
+
+
 def find(node: Any, path: str) -> Any:
     """Return what nested settings hold at a dotted path, in lists by number; None for nothing."""
     for key in path.split("."):

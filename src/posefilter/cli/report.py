@@ -18,6 +18,7 @@ from posefilter.files import write_whole
 from posefilter.paths import check_links
 from posefilter.report.comparison_page import make_comparison_page, read_two_runs
 from posefilter.report.gather import Run, read_run
+from posefilter.report.page import Page
 from posefilter.report.run_page import make_run_page
 from posefilter.report.settings import Change, compare_settings
 from posefilter.report.sweep_page import make_sweep_page
@@ -60,11 +61,17 @@ def report(job: Job) -> None:
         if job.cfg.out
         else folder / ("comparison" if kind == "runs" else "report")
     )
-    write_whole(out / "report.html", page.render())
+    charts = write_page(page, out)
+    ended(job.cfg.console, "reported", {"report": out / "report.html", f"{charts} charts": out})
+
+
+def write_page(page: Page, folder: Path) -> int:
+    """Write a page, and its charts as pictures; return how many there are."""
+    write_whole(folder / "report.html", page.render())
     files = page.files()
     for name, png in files.items():
-        write_whole(out / name, png)
-    ended(job.cfg.console, "reported", {"report": out / "report.html", f"{len(files)} charts": out})
+        write_whole(folder / name, png)
+    return len(files)
 
 
 def with_todays_names(run: Run) -> Run:

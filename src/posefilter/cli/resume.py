@@ -9,7 +9,7 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import HydraException
 
 from posefilter.cli.arguments import quoted
-from posefilter.cli.plain import find
+from posefilter.cli.plain import find, key_of
 from posefilter.cli.renamed import update
 from posefilter.errors import BadData, UserError
 from posefilter.limits import read_bytes, read_yaml
@@ -72,16 +72,16 @@ def with_resumed(arguments: list[str]) -> list[str]:
     check_links(folder)
     for argument in arguments:
         check_kept(argument, folder)
-    named = {a.split("=", 1)[0].lstrip("+~") for a in arguments}
+    named = {*map(key_of, arguments)}
     before = [update(one, "train") for one in overrides_of(folder)]
-    kept = [one for one in before if _key(one) not in named and _key(one) not in _DROPPED]
-    added = {_key(one) for one in before if one.startswith("+")}
+    kept = [one for one in before if key_of(one) not in named and key_of(one) not in _DROPPED]
+    added = {key_of(one) for one in before if one.startswith("+")}
     # `~key` of what the run had added: it is left out, and nothing is there to be deleted
-    arguments = [a for a in arguments if not (a.startswith("~") and _key(a) in added)]
+    arguments = [a for a in arguments if not (a.startswith("~") and key_of(a) in added)]
     for override in kept:
         check_override(override, folder)
     # a choice of `sweep` brings the jobs' settings, and would start them all
-    alone = ["hydra.mode=RUN"] if any(_key(one) == "sweep" for one in kept) else []
+    alone = ["hydra.mode=RUN"] if any(key_of(one) == "sweep" for one in kept) else []
     return [*kept, *arguments, f"out={folder}", *alone]
 
 
@@ -103,7 +103,6 @@ def overrides_of(folder: Path) -> list[str]:
         before = read_yaml(file, _LONGEST)
     except BadData:
         before = None
-    before = [] if before == [] else before
     if not (
         isinstance(before, list)
         and len(before) <= _MOST
@@ -159,14 +158,13 @@ def list_unkept(overrides: list[str], folder: Path) -> list[str]:
             return False
         return True
 
-    own = [one for one in overrides if _key(one) not in _DROPPED]
+    own = [one for one in overrides if key_of(one) not in _DROPPED]
     return [shlex.quote(one) for one in own if not is_kept(one)]
 
 
 def check_kept(argument: str, folder: Path) -> None:
     """Raise UserError where an argument changes a setting that a run keeps."""
-    key, _, value = argument.partition("=")
-    key = key.lstrip("+~")
+    key, value = key_of(argument), argument.partition("=")[2]
     out = str(_read_value(argument)) if key == "out" and value not in ("", "null") else str(folder)
     if Path(out).resolve() != folder.resolve():
         raise UserError(
@@ -211,7 +209,3 @@ def _resumed(arguments: list[str]) -> str | None:
     # a name with a = or a comma is typed in Hydra's quotes
     is_quoted = given[-1][0] in "'\""
     return str(_read_value(f"resume={given[-1]}")) if is_quoted else given[-1]
-
-
-def _key(override: str) -> str:
-    return override.split("=", 1)[0].lstrip("+~")
