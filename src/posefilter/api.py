@@ -10,6 +10,7 @@ from omegaconf import DictConfig
 from posefilter.cli.checkpoints import build_method, methods_of, recipe
 from posefilter.cli.components import SECTIONS, changes
 from posefilter.cli.job import Job
+from posefilter.cli.plain import key_of
 from posefilter.confidence.tolerance import PoseTolerance
 from posefilter.confidence.verdicts import Costs
 from posefilter.errors import UserError
@@ -87,7 +88,7 @@ def check_overrides(overrides: Iterable[str]) -> list[str]:
     """
     found = _list_overrides(overrides, "filter.particles=1000")
     for one in found:
-        key = one.lstrip("+~").split("=")[0].split("@")[0]
+        key = key_of(one).split("@")[0]
         if not key.startswith(tuple(f"{section}{mark}" for section in SECTIONS for mark in "./")):
             instead = f": {_INSTEAD[key]}" if key in _INSTEAD else ""
             raise UserError(

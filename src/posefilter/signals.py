@@ -39,11 +39,7 @@ def leave_signals_to_parent(_: int = 0) -> None:
         _: The worker's number, which torch's data loader passes.
     """
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    signal.signal(signal.SIGTERM, _take_default)
-
-
-def _take_default(number: int, _: FrameType | None) -> None:
-    signal.signal(number, signal.SIG_DFL)
+    signal.signal(signal.SIGTERM, lambda number, _: signal.signal(number, signal.SIG_DFL))
 
 
 def end_with_parent() -> None:

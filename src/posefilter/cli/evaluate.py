@@ -23,6 +23,7 @@ from posefilter.cli.folders import holds_evaluation, read_results
 from posefilter.cli.job import Job
 from posefilter.cli.learned import DATA, list_learned
 from posefilter.cli.machine import settle
+from posefilter.cli.plain import to_plain
 from posefilter.cli.progress_bar import progress
 from posefilter.cli.recipe import check_data
 from posefilter.cli.results import record, show, write_json
@@ -276,8 +277,7 @@ def data_settings(
     unless typed; the split is the checkpoint's where it was trained on the same folder, and else
     every frame is tested, as it is of another of BOP's splits.
     """
-    said = OmegaConf.to_container(job.cfg.data, resolve=False) if job.cfg.get("data") else {}
-    assert isinstance(said, dict)
+    said = to_plain(job.cfg.data) if job.cfg.get("data") else {}
     own = trained.get("data") or {}
     pairs = [
         o.lstrip("+~").partition("=") for o in job.overrides if o.lstrip("+~").startswith("data.")
@@ -321,9 +321,7 @@ def data_settings(
     data = OmegaConf.create({**tree, "data": settings}).data
     OmegaConf.resolve(data)
     if not chosen:
-        plain = OmegaConf.to_container(data)
-        assert isinstance(plain, dict)
-        check_data({str(key): value for key, value in plain.items()}, typed)
+        check_data(to_plain(data), typed)
     if data.get("generate") and not any(key.startswith("generate") for key in typed):
         data.generate = None  # a mistyped folder must not be filled with a new dataset
     return data

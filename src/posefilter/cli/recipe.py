@@ -52,8 +52,7 @@ def resolve_foreign(settings: dict[str, Any]) -> dict[str, Any]:
         foreign = isinstance(value, str) and "${" in _REFERENCE.sub("", value)
         return resolve(OmegaConf.select(tree, place)) if foreign else value
 
-    out: dict[str, Any] = map_values(settings, resolve_value)
-    return out
+    return dict(map_values(settings, resolve_value))
 
 
 def check_recipe(recipe: Any, said: str) -> dict[str, Any]:
@@ -208,8 +207,7 @@ def _without_selects(settings: dict[str, Any]) -> dict[str, Any]:
             return f"${{{found[1]}}}"
         return None if found[2] == "null" else int(found[2])
 
-    out: dict[str, Any] = map_values(settings, refer)
-    return out
+    return dict(map_values(settings, refer))
 
 
 def _check_expansion(settings: dict[str, Any], said: str) -> None:

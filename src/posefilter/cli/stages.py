@@ -114,8 +114,7 @@ class Stages:
 
 def _plain(settings: Mapping[str, Any]) -> dict[str, Any]:
     """Return settings as a JSON file gives them back."""
-    plain: dict[str, Any] = json.loads(json.dumps(dict(settings), default=str))
-    return plain
+    return dict(json.loads(json.dumps(dict(settings), default=str)))
 
 
 def _differing(before: Mapping[str, Any], settings: Mapping[str, Any]) -> list[str]:

@@ -26,6 +26,7 @@ _INDENT, _NARROWEST, _WIDEST = 26, 60, 120
 _MEANINGS = {
     "variant": "(paper: as published; working: with this project's modifications, which work)"
 }
+_FILTER = {"filter.particles": "number of particles; filter.steps: number of filter steps"}
 _TOLERANCE = {
     "pose_tolerance.add_s": "largest ADD-S of a right pose; or .add, .translation_mm, .rotation_deg"
 }
@@ -34,20 +35,17 @@ _SECTIONS = {
     "train": {
         "data.root": "folder of the dataset; with data=scenes, where scenes are rendered",
         "data.object": "name of the object in the dataset",
-        "filter.particles": "number of particles; filter.steps: number of filter steps",
+        **_FILTER,
         "trainer.max_steps": "number of training steps",
         "optimizer.lr": "learning rate",
     },
     "evaluate": {
         "data.root": "folder of the dataset",
         "data.meshes": "builtin, or a folder of meshes",
-        "filter.particles": "number of particles; filter.steps: number of filter steps",
+        **_FILTER,
         **_TOLERANCE,
     },
-    "predict": {
-        "filter.particles": "number of particles; filter.steps: number of filter steps",
-        **_TOLERANCE,
-    },
+    "predict": {**_FILTER, **_TOLERANCE},
     "track": {
         "data.root": "folder of the dataset, where data= is given",
         "tracker.motion.translation_mm": "least standard deviation of a frame's motion",
