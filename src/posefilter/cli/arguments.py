@@ -25,6 +25,10 @@ _PLACES = (
     *("estimates", "targets", "absent", "run", "distractor_meshes", "data.root", "data.meshes"),
     *("data.cache_dir", "data.model_points_dir", "generate.meshes", "data.generate.meshes"),
 )
+_LISTED = re.compile(  # a glimpse's size is one number
+    r"^((?:\w+\.)*(?:intrinsics|distortion|camera)|(?:(?:\w+\.)*generate\.)?size)"
+    r"=([^\[\],]+(?:,[^\[\],]+)+)$"
+)
 _NUMBER = re.compile(r"[+-]?[0-9_.]*[0-9][0-9_.]*([eE][+-]?[0-9_]+)?")
 _FOLDERS = ("run", "runs", "sweep", "out")  # of a report
 
@@ -72,16 +76,7 @@ def bracketed(arguments: list[str]) -> list[str]:
     """Put brackets round the plain lists that some settings take: intrinsics=1,2,3,4 is four
     numbers, not a sweep.
     """
-    return [
-        re.sub(
-            # a glimpse's size is one number
-            r"^((?:\w+\.)*(?:intrinsics|distortion|camera)|(?:(?:\w+\.)*generate\.)?size)"
-            r"=([^\[\],]+(?:,[^\[\],]+)+)$",
-            r"\1=[\2]",
-            a,
-        )
-        for a in arguments
-    ]
+    return [_LISTED.sub(r"\1=[\2]", argument) for argument in arguments]
 
 
 def without_trace(arguments: list[str], name: str) -> list[str]:

@@ -143,9 +143,8 @@ def make_trainer(
     if str(precision) not in ("32-true", "32"):
         raise UserError(
             f"trainer.precision={precision}: half precision costs a pose millimeters, and double "
-            f"slows all down; "
-            "leave it at 32-true (networks take bfloat16 by themselves where that is fast and "
-            "safe)"
+            "slows all down; leave it at 32-true (networks take bfloat16 by themselves where that "
+            "is fast and safe)"
         )
     if node.get("accelerator") == "auto":  # Lightning's takes what has no float64, too
         node = node.copy()

@@ -352,9 +352,8 @@ def object_to_judge(data: PoseDataModule, own: ObjectModel) -> ObjectModel:
     if shift > _SAME_OBJECT or abs(theirs.radius - own.radius) > _SAME_OBJECT:
         raise UserError(
             f"data.meshes={data.meshes.root}: its {own.name} is not the mesh that the checkpoint "
-            f"was trained on "
-            f"(center {1000 * shift:.1f} mm off, radius {1000 * theirs.radius:.1f} mm against "
-            f"{1000 * own.radius:.1f} mm)"
+            f"was trained on (center {1000 * shift:.1f} mm off, radius {1000 * theirs.radius:.1f} "
+            f"mm against {1000 * own.radius:.1f} mm)"
         )
     return own._replace(
         points=theirs.points,

@@ -150,16 +150,13 @@ def list_unkept(overrides: list[str], folder: Path) -> list[str]:
     """Return those overrides of a run that must be typed again to resume it, see `check_override`,
     as they are typed in a shell.
     """
-
-    def is_kept(override: str) -> bool:
+    words = []
+    for override in (one for one in overrides if key_of(one) not in _DROPPED):
         try:
             check_override(override, folder)
         except UserError:
-            return False
-        return True
-
-    own = [one for one in overrides if key_of(one) not in _DROPPED]
-    return [shlex.quote(one) for one in own if not is_kept(one)]
+            words.append(shlex.quote(override))
+    return words
 
 
 def check_kept(argument: str, folder: Path) -> None:

@@ -54,8 +54,7 @@ def load_shape(store: "MeshStore | None", object_model: ObjectModel) -> Shape:
     ]
     cause = f"give {fitting[0]}" if fitting else "is it a mesh of another object?"
     raise UserError(
-        f"meshes={store.root}: {object_model.name} is "
-        f"{1000 * ratio * object_model.diameter:.3g} mm across with "
-        f"mesh_scale={store.scale:g}, and the checkpoint's object "
+        f"meshes={store.root}: {object_model.name} is {1000 * ratio * object_model.diameter:.3g} "
+        f"mm across with mesh_scale={store.scale:g}, and the checkpoint's object "
         f"{1000 * object_model.diameter:.0f} mm; {cause}"
     )
