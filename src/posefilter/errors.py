@@ -1,6 +1,4 @@
-"""What stands for a user's mistake: the commands print its single line and exit with status 2; and
-for a user's wish to stop.
-"""
+"""What stands for a user's mistake, which a command tells in a line, and for a wish to stop."""
 
 import math
 from collections.abc import Sequence
@@ -19,9 +17,7 @@ class UserError(Exception):
 
 
 def find_reason(error: BaseException) -> str:
-    """Return what an error says in one line: its message's first, or its class where there is
-    none.
-    """
+    """Return the first line of an error's message, or its class where there is none."""
     lines = str(error).splitlines()
     return lines[0] if lines else type(error).__name__
 

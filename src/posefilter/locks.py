@@ -1,6 +1,4 @@
-"""One writer a folder: a lock of the operating system, which ends with the process that holds it,
-however that ends.
-"""
+"""One writer a folder: a lock of the operating system, which ends with its process."""
 
 import errno
 import logging

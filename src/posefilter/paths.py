@@ -1,6 +1,4 @@
-"""Keep what files say about other files inside one folder: no absolute path, no `..`, no link that
-leads out.
-"""
+"""Keep what files say of other files inside one folder: no absolute path, no `..`, no link out."""
 
 import os
 import unicodedata
@@ -72,9 +70,7 @@ def check_inside(path: Path, root: Path) -> Path:
 
 
 def check_links(folder: Path) -> None:
-    """Raise UserError where a link in a folder leads out of it: what is written there would go
-    elsewhere.
-    """
+    """Raise UserError where a link leads out of a folder: what is written would go elsewhere."""
     home = os.path.realpath(folder)
     for place, folders, files in os.walk(folder):
         for name in (*folders, *files):

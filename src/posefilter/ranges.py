@@ -1,6 +1,4 @@
-"""Ranges of numeric settings, in one table: a value that makes no sense is refused in one line, by
-its key, before anything is built.
-"""
+"""Ranges of numeric settings: what makes no sense is refused by its key, before all is built."""
 
 import math
 import re

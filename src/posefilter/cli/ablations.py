@@ -232,9 +232,7 @@ BY_NAME = {ablation.name: ablation for ablation in ABLATIONS}
 
 
 def list_pose_ablations() -> list[str]:
-    """Return the names of the rows for image-space methods with a pose, in order of the table's
-    sweep.
-    """
+    """Return the rows for image-space methods with a pose, in order of the table's sweep."""
     return _in_order([a.name for a in IMAGE_SPACE_ABLATIONS if not a.name.startswith("box_")])
 
 

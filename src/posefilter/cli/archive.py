@@ -1,6 +1,4 @@
-"""A checkpoint's file is data that others may have written: check its archive before it is read,
-and its tensors after.
-"""
+"""Check a checkpoint, which others may have written: its archive, and its tensors."""
 
 import re
 import stat
@@ -111,9 +109,7 @@ def check_content(checkpoint: Any, file: Path, said: str) -> dict[str, Any]:
 
 
 def check_tensor(value: Tensor, size: int, said: str) -> None:
-    """Raise UserError unless a tensor is a plain one whose elements all lie in a file of this size
-    [bytes].
-    """
+    """Raise UserError unless a tensor is plain, and all of it in a file of this size [bytes]."""
     shape = list(value.shape)
     plain = (
         type(value) in (Tensor, nn.Parameter)

@@ -73,9 +73,7 @@ def _at_home(found: re.Match[str]) -> str:
 
 
 def bracketed(arguments: list[str]) -> list[str]:
-    """Put brackets round the plain lists that some settings take: intrinsics=1,2,3,4 is four
-    numbers, not a sweep.
-    """
+    """Put brackets round plain lists: intrinsics=1,2,3,4 is four numbers, not a sweep."""
     return [_LISTED.sub(r"\1=[\2]", argument) for argument in arguments]
 
 
@@ -172,9 +170,7 @@ def told_apart(arguments: Sequence[str], name: str, conf: Path) -> list[str]:
 
 
 def _written(value: str) -> bool:
-    """Tell whether a value is written in Hydra's grammar: quoted, a list, one that refers to
-    another, or with escapes.
-    """
+    """Tell whether a value is in Hydra's grammar: quoted, a list, a reference, or with escapes."""
     if value.startswith(("'", '"', "[", "{")) or "${" in value or value.rstrip().endswith(")"):
         return True
     return re.search(r"\\[=,]", value) is not None

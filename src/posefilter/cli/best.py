@@ -188,9 +188,7 @@ def check_kept(callbacks: Sequence[Callback], folder: Path) -> None:
 
 
 def _find_mode(monitor: str) -> str | None:
-    """Return which way a number of the validation is better, "max" or "min"; None where that is not
-    known, as of a plug-in's.
-    """
+    """Return which way a number of the validation is better, "max" or "min"; None: not known."""
     try:
         direction = find_metric(monitor).direction
     except UserError:

@@ -1,6 +1,4 @@
-"""Estimates of several instances against the instances of a dataset, as the BOP challenge scores
-them.
-"""
+"""Estimates of several instances against a dataset's, as the BOP challenge scores them."""
 
 from collections.abc import Iterable, Sequence
 from contextlib import suppress

@@ -55,9 +55,7 @@ def build_data(node: DictConfig, console: str, overrides: Sequence[str] = ()) ->
 
 
 def _check_rendered(root: Path, settings: Mapping[str, Any], overrides: Sequence[str]) -> None:
-    """Refuse scenes that are there and were rendered otherwise than is typed: they are not rendered
-    anew.
-    """
+    """Refuse scenes that were rendered otherwise than is typed: they are not rendered anew."""
     keys = {*map(key_of, overrides)}
     typed = {name for name in settings if f"data.generate.{name}" in keys}
     if not typed:

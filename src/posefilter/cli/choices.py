@@ -78,9 +78,7 @@ def check_added(
 
 
 def check_names(folders: Sequence[Path]) -> None:
-    """Raise UserError where a file of a later folder has the name of one of an earlier folder,
-    which Hydra would read instead.
-    """
+    """Raise UserError where a file is hidden by one of its name in an earlier folder."""
     first = dict[Path, Path]()
     for folder in folders:
         for file in sorted(folder.rglob("*.yaml")):
@@ -104,9 +102,7 @@ def check_several(group: str, value: str, folders: Sequence[Path]) -> None:
 
 
 def check_variants(arguments: Sequence[str], conf: Path) -> None:
-    """Raise UserError where a method is asked for a variant that it has not: Hydra would leave the
-    method without any preset.
-    """
+    """Raise UserError for a variant that a method lacks: Hydra would leave it without a preset."""
     typed = dict(a.split("=", 1) for a in arguments if "=" in a)
     for model, variant in product(*(typed.get(k, "").split(",") for k in ("model", "variant"))):
         known = list_choices(conf / "preset" / model) if re.fullmatch(r"\w+", model) else []
@@ -119,9 +115,7 @@ def check_variants(arguments: Sequence[str], conf: Path) -> None:
 
 
 def check_preset(name: str, folders: Sequence[Path]) -> None:
-    """Raise UserError where no folder has a preset: a method need not have one, so that Hydra would
-    not complain.
-    """
+    """Raise UserError where no folder has a preset: it need not be there, so Hydra is silent."""
     if any((folder / "preset" / f"{name}.yaml").is_file() for folder in folders):
         return
     known = [
@@ -141,9 +135,7 @@ def say_no_choice(group: str, name: str, known: Sequence[str]) -> str:
 
 
 def config_folders(arguments: Sequence[str]) -> list[Path]:
-    """Return the folder of settings that was typed by --config-dir (or -cd): of several, Hydra
-    takes the last.
-    """
+    """Return the folder typed by --config-dir (or -cd): of several, Hydra takes the last."""
     words = [part for a in arguments for part in a.split("=", 1)]
     return [Path(b) for a, b in pairwise(words) if a in ("--config-dir", "-cd")][-1:]
 

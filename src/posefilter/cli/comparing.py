@@ -15,9 +15,7 @@ _PASSING = (*PASSING, "callbacks", "logger")  # where and how, not what
 
 
 def comparable(job: Job) -> dict[str, bool | int | float | str]:
-    """Return a job's choices by group, and its settings by dotted key; a setting that repeats
-    another is left out.
-    """
+    """Return a job's choices by group, and its settings, but those that repeat others, by key."""
     choices: dict[str, bool | int | float | str] = {
         group: choice
         for group, choice in chosen(job).items()
@@ -28,9 +26,7 @@ def comparable(job: Job) -> dict[str, bool | int | float | str]:
 
 
 def differing(then: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]:
-    """Return the choices and settings in which two recipes differ, such as a default that has
-    changed since.
-    """
+    """Return the choices and settings in which two recipes differ, as by a default of today."""
     groups = {
         group
         for group in {*then["choices"]} & {*now["choices"]}

@@ -15,9 +15,7 @@ LOOSE = ("evaluate", "predict", "track", "convert_bag", "export", "calibrate")
 
 
 def loosen(arguments: list[str], name: str) -> list[str]:
-    """Let settings through that only the checkpoint knows: `filter.particles=9` becomes
-    `++filter.particles=9`.
-    """
+    """Let settings through that only the checkpoint knows: `filter.particles=9` gets a `++`."""
     if name not in LOOSE:
         return arguments
     keys = tuple(f"{section}." for section in (*SECTIONS, "data"))

@@ -1,6 +1,4 @@
-"""What a command says: sentences and tables for people, or with console=json one JSON object a line
-on stdout.
-"""
+"""What a command says: sentences and tables, or with console=json a JSON object a line."""
 
 import json
 import logging

@@ -170,9 +170,7 @@ def near(wrong: str, known: list[str]) -> str:
 
 
 def compose_without(wrong: str, name: str, conf: Path, arguments: list[str]) -> DictConfig:
-    """Compose a command's settings without the argument that sets a wrong key; without any where
-    others are wrong too.
-    """
+    """Compose a command's settings without a wrong argument; without any where others are, too."""
     good = [a for a in arguments if "=" in a and not a.startswith(("-", wrong)) and "," not in a]
     folders = ",".join(f"'file://{folder.resolve()}'" for folder in config_folders(arguments))
     good += [f"hydra.searchpath=[{folders}]"] if folders else []

@@ -77,13 +77,7 @@ def check_fit(settings: DictConfig, choices: Mapping[str, str], scope: Scope) ->
 
 
 def resolve_known(tree: Any, place: str) -> Any:
-    """Return a part of plain settings with every reference in it replaced, save those to what there
-    is not.
-
-    Args:
-        tree: The whole configuration, plain and not resolved.
-        place: The part's place.
-    """
+    """Return the part of plain settings at a place, all references in it replaced that can be."""
 
     def walk(node: Any, depth: int) -> Any:
         if isinstance(node, dict):
@@ -122,13 +116,7 @@ def declared_by(target: str, key: str, scope: Scope) -> Declared:
 
 
 def read_attribute(module: str, name: str, attribute: str) -> tuple[str, ...] | None:
-    """Return a class attribute from the source of posefilter, where it or a parent sets one.
-
-    Args:
-        module: The class's module.
-        name: The class.
-        attribute: The attribute, whose value must be written as a literal.
-    """
+    """Return a class's attribute, a literal, from the source of posefilter, or its parent's."""
     kind = parse_module(module).get(name)
     if isinstance(kind, ast.ImportFrom):
         return read_attribute(kind.module or "", name, attribute)
@@ -278,9 +266,7 @@ class Advice:
         ]
 
     def _list_declared(self, group: str) -> Iterator[tuple[str, list[Declared]]]:
-        """Yield a group's choices with what their classes declare, but for drafts, which cannot be
-        chosen.
-        """
+        """Yield a group's choices with what their classes declare; drafts cannot be chosen."""
         for option in self.groups.list_options(group):
             with suppress(UserError):
                 targets = option.targets().items()

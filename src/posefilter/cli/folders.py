@@ -116,9 +116,7 @@ def read_results(job: Job) -> dict[str, Any]:
 
 
 def deciding(overrides: list[str]) -> list[str]:
-    """Return what was typed, in one order, less what says where and with how many hands a run is
-    done.
-    """
+    """Return what was typed, in one order, less what says where and with how many hands."""
     return sorted(typed for typed in overrides if key_of(typed) not in HANDS)
 
 

@@ -1,6 +1,4 @@
-"""Build objects from configuration nodes: the one place in which a name in a YAML file becomes
-code.
-"""
+"""Build objects of settings: the one place where a name in a YAML file becomes code."""
 
 import difflib
 import functools
@@ -220,9 +218,7 @@ def check_arguments(
 
 
 def fits(value: Any, wanted: Any) -> bool:
-    """Tell whether a value may be what an annotation asks for; of types that are not plain, only
-    that it is not plain.
-    """
+    """Tell whether a value may be what an annotation asks for, as far as it is plain."""
     if wanted in (inspect.Parameter.empty, Any) or isinstance(wanted, str | typing.TypeVar):
         return True
     origin, inner = get_origin(wanted), get_args(wanted)

@@ -96,9 +96,7 @@ def check_out(cfg: DictConfig) -> None:
 
 
 def _resolve(cfg: DictConfig) -> dict[str, Any]:
-    """Return settings with what they refer to; without those that refer to nothing, which is told
-    where they are read.
-    """
+    """Return settings with what they refer to, less those that refer to nothing: told when read."""
     out: dict[str, Any] = {}
     for key in cfg:
         with suppress(OmegaConfBaseException):

@@ -68,9 +68,7 @@ def device_name(device: torch.device | None = None) -> str:
 
 
 def git_state() -> str | None:
-    """Return the commit of the code, with `+` where files differ from it; None outside its
-    clone.
-    """
+    """Return the commit of the code, with `+` where files differ; None outside its clone."""
     home = Path(__file__).parent
     if not (home.parents[2] / ".git").exists():
         return None  # installed: a repository around it is another's

@@ -24,11 +24,7 @@ class Speed(NamedTuple):
 
 
 def measure_speed(job: Job) -> Speed:
-    """Measure a training by some steps that are thrown away, with all that it wrote.
-
-    Args:
-        job: Its trainer writes into a folder that is removed.
-    """
+    """Measure a training by some steps; these, and all that it wrote, are thrown away."""
     cfg = job.cfg.copy()
     cfg.trainer.max_steps = cfg.trainer.val_check_interval = _STEPS
     cfg.trainer.limit_val_batches = 0

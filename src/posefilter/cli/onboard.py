@@ -1,6 +1,4 @@
-"""From a mesh to trained weights and a report, in stages; interrupted and typed again, it goes
-on.
-"""
+"""From a mesh to trained weights and a report, in stages; it goes on where it was interrupted."""
 
 import math
 import time
@@ -347,9 +345,7 @@ def calibrate(work: Onboarding) -> None:
 
 
 def evaluate(work: Onboarding) -> None:
-    """Test the weights that predict on held-out renders, with the second look that their
-    calibration allows.
-    """
+    """Test the weights on held-out renders, with the second look that their calibration allows."""
     training = {**work.stages.values["training"], "tested_step": step_of(work.run.best)}
     results = test(work.run, read_checkpoint(work.weights))
     finish(work.run, training, results, work.weights)

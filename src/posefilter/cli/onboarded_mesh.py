@@ -58,9 +58,7 @@ def read_onboarded(cfg: DictConfig) -> Mesh:
 
 
 def name_of(path: Path) -> str:
-    """Return an object's name by its file: `.../035_power_drill/google_16k/textured.obj` is one
-    of 035_power_drill.
-    """
+    """Return an object's name: `035_power_drill/google_16k/textured.obj` is a 035_power_drill."""
     parts = [path.stem, *(parent.name for parent in path.absolute().parents)]
     name = next(part for part in parts if part.lower() not in _UNNAMED)
     return re.sub(r"[^\w\-]+", "_", name).strip("_") or "object"

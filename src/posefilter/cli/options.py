@@ -99,9 +99,7 @@ def _merge(old: Any, new: Any) -> Any:
 
 @contextmanager
 def open_groups() -> Iterator[Groups]:
-    """Yield the groups of the running command, else those of the project's own folder and of
-    plug-ins.
-    """
+    """Yield the groups of the running command, else of the project's own folder and plug-ins."""
     add_plugin_folders()
     if GlobalHydra.instance().is_initialized():
         yield Groups(GlobalHydra.instance().config_loader())

@@ -307,9 +307,7 @@ def describe_belief(result: Result) -> dict[str, Any]:
 def describe_absent(
     name: str, score_is: str, costs: Costs, checkpoint: str | Path, job: Job
 ) -> dict[str, Any]:
-    """Return the entry of poses.json of an object of which nothing is found: every key, null where
-    there is nothing to say.
-    """
+    """Return what is written of an object that is not found: null where there is nothing to say."""
     return {
         "object": name,
         "instance": None,

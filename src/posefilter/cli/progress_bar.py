@@ -41,9 +41,7 @@ def briefly(metrics: dict[str, Any]) -> str:
 
 
 def count_steps(trainer: Trainer) -> int | None:
-    """Return how many steps a training has, by its epochs too; None where only the clock ends
-    it.
-    """
+    """Return how many steps a training has, by its epochs too; None: only the clock ends it."""
     steps = trainer.estimated_stepping_batches
     return int(steps) if math.isfinite(steps) else None
 
@@ -105,9 +103,7 @@ class Lines(Callback):
 
 
 class Bars(Callback):
-    """A bar over the training's steps with its loss and last figures, one for each validation or
-    test.
-    """
+    """A bar over the training's steps, with loss and last figures; one a validation or test."""
 
     def __init__(self) -> None:
         self._bars: Progress | None = None

@@ -43,9 +43,7 @@ _SELECT = re.compile(r"\$\{oc\.select:([A-Za-z_]\w*(?:\.\w+)*),(-?\d{1,6}|null)\
 
 
 def resolve_foreign(settings: dict[str, Any]) -> dict[str, Any]:
-    """Return the user's settings with every interpolation but references resolved: what a recipe
-    may hold.
-    """
+    """Return settings with every interpolation but references resolved, as a recipe has them."""
     tree = OmegaConf.create(settings)
 
     def resolve_value(value: Any, place: str) -> Any:
@@ -96,9 +94,7 @@ def check_recipe(recipe: Any, said: str) -> dict[str, Any]:
 
 
 def without_pretrained(node: Any) -> Any:
-    """Return settings in which no component names a file of weights: those of the checkpoint take
-    their place.
-    """
+    """Return settings that name no file of weights: those of the checkpoint take their place."""
     if isinstance(node, dict):
         plain = {key: without_pretrained(value) for key, value in node.items()}
         return plain | {key: None for key in PRETRAINED if key in node and "_target_" in node}
@@ -211,9 +207,7 @@ def _without_selects(settings: dict[str, Any]) -> dict[str, Any]:
 
 
 def _check_expansion(settings: dict[str, Any], said: str) -> None:
-    """Raise UserError where settings that refer to each other would never end, or grow out of
-    bounds.
-    """
+    """Raise UserError where references would never end, or grow out of bounds."""
     stack, count = [(0, settings)], 0
     while stack:
         depth, node = stack.pop()

@@ -429,12 +429,7 @@ def _below(target: object) -> str:
 
 
 def rename_argument(target: object, name: str) -> str | None:
-    """Return what an argument of a class is called today; None where its name has not changed.
-
-    Args:
-        target: The class, as `_target_` names it.
-        name: The argument, as it was called before.
-    """
+    """Return what an argument of a class, a `_target_`, is called today; None: as before."""
     return ARGUMENTS.get(_below(target), {}).get(name)
 
 

@@ -31,14 +31,10 @@ def record(
     checkpoint: Path | None,
     device: torch.device | None = None,
 ) -> dict[str, Any]:
-    """Return the whole of metrics.json: what was found, where, and all that it takes to find it
-    again.
-    """
+    """Return metrics.json: what was found, where, and all that it takes to find it again."""
     return {
         **results,
-        "model": job.choices.get("model"),
-        "loss": job.choices.get("loss"),
-        "variant": job.choices.get("variant"),
+        **{group: job.choices.get(group) for group in ("model", "loss", "variant")},
         "seed": job.cfg.get("seed"),
         "tags": [*(job.cfg.get("tags") or [])],
         "data": data,

@@ -1,6 +1,4 @@
-"""Where Hydra looks for choices: also in the folder `conf` inside each package that the user
-trusts.
-"""
+"""Where Hydra looks for choices: also in the folder `conf` of packages that the user trusts."""
 
 from hydra.core.config_search_path import ConfigSearchPath
 from hydra.core.plugins import Plugins

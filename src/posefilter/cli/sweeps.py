@@ -1,6 +1,4 @@
-"""What a sweep found, in one place: summary.csv, summary.md and summary.png, brought up to date as
-each job ends.
-"""
+"""What a sweep found: summary.csv, summary.md and summary.png, brought up to date by each job."""
 
 import csv
 from pathlib import Path
@@ -61,9 +59,7 @@ def _list_failures(folder: Path) -> dict[Path, int]:
 
 
 def summarize(folder: Path) -> list[Row]:
-    """Write the three files of a sweep's folder; return its rows, none where no job has ended
-    yet.
-    """
+    """Write the three files of a sweep's folder; return its rows, none before a job has ended."""
     if not any(any(folder.glob(f"*/**/{mark}")) for mark in ("metrics.json", FAILED)):
         return []
     from posefilter.report.summary import draw_summary  # Hydra makes this callback in every run

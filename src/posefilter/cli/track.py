@@ -283,9 +283,7 @@ def open_videos(cfg: DictConfig, objects: Sequence[str]) -> tuple[Sequence[Video
 
 
 def _is_meant(scene: Scene, asked: Any) -> bool:
-    """Tell whether a scene is meant: by its name, by its place's, or by its number where that is a
-    number.
-    """
+    """Tell whether a scene is meant: by its name, its place's, or its number."""
     group, name = scene.group, str(asked)
     same = group.isdigit() and name.isdigit() and int(group) == int(name)
     return same or name in (group, scene.name)

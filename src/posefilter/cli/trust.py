@@ -68,9 +68,7 @@ _trusted: set[str] = set()
 
 
 class Scope(Enum):
-    """Where a `_target_` stands: in the user's own settings, or in those that a checkpoint
-    carries.
-    """
+    """Where a `_target_` stands: in the user's own settings, or in a checkpoint's."""
 
     CONFIG = "your settings"
     RECIPE = "a checkpoint"

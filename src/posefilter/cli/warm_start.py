@@ -1,6 +1,4 @@
-"""Begin a run with the weights of finished ones, of other objects or other data: most of what is
-learned is shared.
-"""
+"""Begin a run with weights of finished ones, also of other objects: most of it is shared."""
 
 from collections.abc import Sequence
 from typing import Any
