@@ -185,7 +185,7 @@ class Advice:
     """
 
     groups: Groups
-    choices: Mapping[str, str]
+    choices: Mapping[str, str]  # which file of each group; others may have been typed since
     components: Sequence[Component]
     scope: Scope
 
