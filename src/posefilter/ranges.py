@@ -1,4 +1,4 @@
-"""Ranges of numeric settings: what makes no sense is refused by its key, before all is built."""
+"""Ranges of numeric settings: a senseless value is refused by its key before anything is built."""
 
 import math
 import re

@@ -115,7 +115,7 @@ def check_variants(arguments: Sequence[str], conf: Path) -> None:
 
 
 def check_preset(name: str, folders: Sequence[Path]) -> None:
-    """Raise UserError where no folder has a preset: it need not be there, so Hydra is silent."""
+    """Raise UserError where no folder has a preset: methods need none, so that Hydra is silent."""
     if any((folder / "preset" / f"{name}.yaml").is_file() for folder in folders):
         return
     known = [

@@ -15,7 +15,7 @@ _PASSING = (*PASSING, "callbacks", "logger")  # where and how, not what
 
 
 def comparable(job: Job) -> dict[str, bool | int | float | str]:
-    """Return a job's choices by group, and its settings, but those that repeat others, by key."""
+    """Return a job's choices, and its settings by dotted key but for those that repeat others."""
     choices: dict[str, bool | int | float | str] = {
         group: choice
         for group, choice in chosen(job).items()

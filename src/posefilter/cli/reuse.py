@@ -39,7 +39,7 @@ def finished(job: Job) -> dict[str, Any] | None:
 
 
 def changed_since(job: Job) -> list[str]:
-    """Return the settings in which a job that is done differs from its words' meaning now."""
+    """Return the settings in which a job that is done differs from what its words mean now."""
     try:
         then = read_checkpoint(job.folder / "checkpoints" / "best.ckpt")["recipe"]
     except UserError:  # what is left of a finished job need not be whole: its results are
