@@ -24,10 +24,9 @@ def loosen(arguments: list[str], name: str) -> list[str]:
 
 def changes(cfg: DictConfig) -> dict[str, Any]:
     """Return what a test-time configuration says of the method."""
-    said = {
+    return {
         name: OmegaConf.to_container(cfg[name], resolve=False) for name in SECTIONS if cfg.get(name)
     }
-    return {name: value for name, value in said.items() if value}
 
 
 def chosen(job: Job) -> dict[str, str]:

@@ -283,7 +283,7 @@ def data_settings(
         o.lstrip("+~").partition("=") for o in job.overrides if o.lstrip("+~").startswith("data.")
     ]
     typed = {key.removeprefix("data."): value.strip("'\"") for key, _, value in pairs}
-    chosen = "_target_" in said
+    chosen, typed_split = "_target_" in said, any(key.startswith("split") for key in typed)
     if own and not chosen and "_target_" not in own:
         raise UserError(
             "data: exported weights carry no dataset; give "
@@ -307,16 +307,14 @@ def data_settings(
             and Path(root).resolve() == Path(before.root).resolve()
             and _bop_split(settings) == _bop_split(own)
         )
-        if not any(key.startswith("split") for key in typed):
+        if not typed_split:
             settings["split"] = before.split if same else {part: 1.0}
             settings["split_seed"] = before.get("split_seed", settings.get("split_seed", 0))
         if "limit_test" not in typed:
             settings["limit_test"] = before.limit_test if same else None
         if same and "min_visibility_test" not in typed:
             settings["min_visibility_test"] = before.min_visibility_test
-    elif (chosen or _bop_split(settings) != _bop_split(own)) and not any(
-        key.startswith("split") for key in typed
-    ):
+    elif (chosen or _bop_split(settings) != _bop_split(own)) and not typed_split:
         settings["split"] = {part: 1.0}
     data = OmegaConf.create({**tree, "data": settings}).data
     OmegaConf.resolve(data)

@@ -228,10 +228,8 @@ def fits(value: Any, wanted: Any) -> bool:
         return value in inner
     if wanted is None or wanted is type(None):
         return value is None
-    if wanted is float:
-        return isinstance(value, int | float) and not isinstance(value, bool)
-    if wanted is int:
-        return isinstance(value, int) and not isinstance(value, bool)
+    if wanted in (int, float):
+        return isinstance(value, int | wanted) and not isinstance(value, bool)
     if wanted in (bool, str, Path):
         return isinstance(value, str if wanted is Path else wanted)
     if origin is tuple and inner and inner[-1] is not Ellipsis:
@@ -242,7 +240,7 @@ def fits(value: Any, wanted: Any) -> bool:
         )
     if isinstance(origin, type) and issubclass(origin, Sequence):
         return isinstance(value, list | tuple) and all(fits(item, inner[0]) for item in value)
-    if origin is not None and isinstance(origin, type) and issubclass(origin, Mapping):
+    if isinstance(origin, type) and issubclass(origin, Mapping):
         return isinstance(value, Mapping)
     if isinstance(value, list | tuple | Mapping):  # no component: that is built from a _target_
         kind = origin or wanted

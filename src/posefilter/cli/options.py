@@ -1,7 +1,7 @@
 """The choices of Hydra's groups, those of plug-ins' folders included, and what each sets."""
 
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager, nullcontext, suppress
 from functools import cache
 from typing import Any, NamedTuple
 
@@ -101,8 +101,7 @@ def _merge(old: Any, new: Any) -> Any:
 def open_groups() -> Iterator[Groups]:
     """Yield the groups of the running command, else of the project's own folder and plug-ins."""
     add_plugin_folders()
-    if GlobalHydra.instance().is_initialized():
+    running = GlobalHydra.instance().is_initialized()
+    conf = str(find_conf().resolve())
+    with nullcontext() if running else initialize_config_dir(conf, version_base="1.3"):
         yield Groups(GlobalHydra.instance().config_loader())
-    else:
-        with initialize_config_dir(str(find_conf().resolve()), version_base="1.3"):
-            yield Groups(GlobalHydra.instance().config_loader())
