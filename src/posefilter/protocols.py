@@ -39,26 +39,21 @@ class Space(Protocol):
     @property
     def dimensions(self) -> int:
         """Return the width of a tangent vector."""
-        ...
 
     def move(self, state: Tensor, tangent: Tensor) -> Tensor:
         """Return states shifted by tangent vectors, the exponential map of the space.
 
         (*, *S), (*, D) -> (*, *S).
         """
-        ...
 
     def noise_scale(self, sigma: Tensor) -> Tensor:
         """Return the standard deviation an axis of a move of size sigma.  (*) -> (*, D)."""
-        ...
 
     def mean(self, state: Tensor, weights: Tensor) -> Tensor:
         """Return the weighted mean of states.  (*, N, *S), (*, N) -> (*, *S)."""
-        ...
 
     def distance(self, a: Tensor, b: Tensor) -> Tensor:
         """Return a distance in the space's unit.  (*, *S) x 2 -> (*)."""
-        ...
 
 
 class Method(Protocol):
@@ -67,24 +62,20 @@ class Method(Protocol):
     @property
     def space(self) -> Space:
         """Return the space this method's particles live in."""
-        ...
 
     @property
     def latent_width(self) -> int:
         """Return L, the width of a particle's latent (0 for none)."""
-        ...
 
     def encode(self, batch: Batch) -> Encoding:
         """Encode the images.  Must not use `batch.mask` or `batch.camera_from_object`, which are
         blank in validation and test.
         """
-        ...
 
     def measure(
         self, encoding: Encoding, particles: Particles, step: Step, generator: Generator
     ) -> ParticleOutput:
         """Measure every particle against the image."""
-        ...
 
 
 @runtime_checkable
@@ -97,7 +88,6 @@ class ScoresPoses(Protocol):
         """Score (B, N, 4, 4) at noise level sigma, from `pixels` image points each -> (B, N),
         differentiable in poses.
         """
-        ...
 
 
 @runtime_checkable
@@ -106,7 +96,6 @@ class ProposesPoses(Protocol):
 
     def propose_poses(self, encoding: Encoding, particles: int, generator: Generator) -> Tensor:
         """Return (B, particles, 4, 4) camera_from_object."""
-        ...
 
 
 @runtime_checkable
@@ -116,7 +105,6 @@ class HasObject(Protocol):
     @property
     def object_model(self) -> ObjectModel:
         """The object."""
-        ...
 
 
 @runtime_checkable
@@ -129,7 +117,6 @@ class HasSurfacePoints(HasObject, Protocol):
         """Return each particle's camera point (B, N, 3) [m], and whether its depth was measured (B,
         N) bool.
         """
-        ...
 
 
 @runtime_checkable
@@ -138,7 +125,6 @@ class HasImagePatches(Protocol):
 
     def image_patches(self, encoding: Encoding, state: Tensor) -> Tensor:
         """Return what particles (B, N, 2) [px] see: (B, N, C, k, k), color in [-1, 1] first."""
-        ...
 
 
 @runtime_checkable
@@ -148,7 +134,6 @@ class HasObjectness(Protocol):
     @property
     def objectness(self) -> Tensor:
         """The objectness of each cell, (B, 1, h, w) >= 0; cells cover the image evenly."""
-        ...
 
 
 @runtime_checkable
@@ -158,12 +143,10 @@ class HasDepth(Protocol):
     @property
     def measured_depth(self) -> Tensor:
         """The z-depth (B, H, W) [m]; 0 unknown."""
-        ...
 
     @property
     def intrinsics(self) -> Tensor:
         """The camera matrices (B, 3, 3) [px]."""
-        ...
 
 
 @runtime_checkable
@@ -173,7 +156,6 @@ class HasColor(HasDepth, Protocol):
     @property
     def measured_color(self) -> Tensor:
         """Red, green and blue (B, 3, H, W) in [0, 1]."""
-        ...
 
 
 class Schedule(Protocol):
@@ -181,7 +163,6 @@ class Schedule(Protocol):
 
     def __call__(self, steps: int) -> list[float]:
         """Return sigma for each of the steps."""
-        ...
 
 
 class Initialize(Protocol):
@@ -191,7 +172,6 @@ class Initialize(Protocol):
         self, batch: Batch, encoding: Encoding, method: Method, particles: int, generator: Generator
     ) -> Tensor:
         """Return states (B, N, *S)."""
-        ...
 
 
 class Reweight(Protocol):
@@ -210,7 +190,6 @@ class Reweight(Protocol):
             ancestor_log_likelihood: (B, N) log-likelihood of each particle's ancestor at the step
                 before; zeros at the first.
         """
-        ...
 
 
 class Resample(Protocol):
@@ -222,7 +201,6 @@ class Resample(Protocol):
         """Draw `count` ancestors of each image (B, count), with the normalized log weights of the
         resampled particles.
         """
-        ...
 
 
 class Propagate(Protocol):
@@ -232,7 +210,6 @@ class Propagate(Protocol):
         self, state: Tensor, displacement: Tensor, step: Step, space: Space, generator: Generator
     ) -> Tensor:
         """(B, N, *S), learned displacement (B, N, D) -> moved states (B, N, *S)."""
-        ...
 
 
 class Estimate(Protocol):
@@ -250,7 +227,6 @@ class Estimate(Protocol):
         generator: Generator,
     ) -> BeliefBatch:
         """Return the belief of the last particles."""
-        ...
 
 
 class Refine(Protocol):
@@ -266,7 +242,6 @@ class Refine(Protocol):
         self, belief: BeliefBatch, encoding: Encoding, method: Method, generator: Generator
     ) -> BeliefBatch:
         """Return the belief with another estimate, or with other particles."""
-        ...
 
 
 class Label(Protocol):
@@ -274,7 +249,6 @@ class Label(Protocol):
 
     def __call__(self, trace: Trace, batch: Batch, object_model: ObjectModel) -> Tensor:
         """Return a target for each particle of each step, (T, B, N) or (T, B, N, D)."""
-        ...
 
 
 class Loss(Protocol):
@@ -282,4 +256,3 @@ class Loss(Protocol):
 
     def __call__(self, trace: Trace, batch: Batch, object_model: ObjectModel) -> Tensor:
         """Return one value an image, (B,)."""
-        ...

@@ -41,7 +41,6 @@ class TruthDensity(Protocol):
         self, particles: Particles, output: ParticleOutput, batch: Batch, object_model: ObjectModel
     ) -> Tensor:
         """Return (B,) [nat]."""
-        ...
 
 
 class MaskDensity:

@@ -15,7 +15,6 @@ class BoxHead(Protocol):
 
     def __call__(self, trace: Trace, batch: Batch, object_model: ObjectModel) -> Tensor:
         """Return (B, 4) [px]; mask and pose of the batch must not be used."""
-        ...
 
 
 def weighted_quantile(values: Tensor, weights: Tensor, quantile: float) -> Tensor:

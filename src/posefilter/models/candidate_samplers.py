@@ -31,7 +31,6 @@ class ScoresSamples(Protocol):
 
     def score_samples(self, position: Tensor, color: Tensor) -> Tensor:
         """Score points (*, 3) in the object frame [m] with colors (*, 3) in [0, 1].  -> (*)."""
-        ...
 
 
 class CandidateSampler:

@@ -130,17 +130,14 @@ class HasCoordinates(Protocol):
     @property
     def coordinates(self) -> Coordinates:
         """The network's output."""
-        ...
 
     @property
     def cells(self) -> Cells:
         """What was measured."""
-        ...
 
     @property
     def mean_radius(self) -> Tensor:
         """() the fragments' mean radius, in radii of the object."""
-        ...
 
 
 class CoordinateLoss:

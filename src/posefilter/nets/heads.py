@@ -24,7 +24,6 @@ class Displacement(Protocol):
         """(B, N, 2), likelihood's logit (B, N), (B, N, 2) [px] in a frame of width x height -> (B,
         N, 2) [px].
         """
-        ...
 
 
 class PosePrediction(NamedTuple):
