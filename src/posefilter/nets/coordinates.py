@@ -113,15 +113,15 @@ def coordinate_loss(
     inside = usable.float()
     count = inside.sum((1, 2)).clamp_min(1.0)
     mean = lambda x: (x * inside).sum((1, 2)) / count  # noqa: E731
-    bce = F.binary_cross_entropy_with_logits(coordinates.logit, on.float(), reduction="none").mean(
-        (1, 2)
-    )
+    bce = F.binary_cross_entropy_with_logits(coordinates.logit, on.float(), reduction="none")
     nll, error = fragment_errors(
         coordinates.log_prob, coordinates.position, coordinates.centers, mean_radius, truth
     )
     distance = (coordinates.coordinate - truth).norm(dim=-1).detach() * radius
     seen = usable.flatten(1).any(1)
-    return 5 * bce + mean(nll + 0.3 * error), torch.where(seen, mean(distance), torch.nan)
+    return 5 * bce.mean((1, 2)) + mean(nll + 0.3 * error), torch.where(
+        seen, mean(distance), torch.nan
+    )
 
 
 class HasCoordinates(Protocol):
@@ -148,12 +148,8 @@ class CoordinateLoss:
     def __call__(self, trace: Trace, batch: Batch, object_model: ObjectModel) -> Tensor:
         """Return the loss of each image, (B,); the trace's encoding is `HasCoordinates`."""
         encoding: HasCoordinates = trace.encoding
-        size = (
-            object_model.center.to(batch.depth),
-            object_model.radius,
-            float(encoding.mean_radius),
-        )
-        pose = batch.camera_from_object
+        center, mean_radius = object_model.center.to(batch.depth), float(encoding.mean_radius)
+        size, pose = (center, object_model.radius, mean_radius), batch.camera_from_object
         return coordinate_loss(encoding.coordinates, encoding.cells, batch.mask, pose, *size)[0]
 
 
@@ -174,23 +170,15 @@ def flatten_context(coordinates: Coordinates, height: int, width: int) -> Contex
     Gradients flow to the features only: the rest is trained by `coordinate_loss`.
     """
     rows, columns = -(-height // 2), -(-width // 2)
-    grid = torch.cat([coordinates.logit.detach()[..., None], coordinates.features], dim=-1).permute(
-        0, 3, 1, 2
+    grid = torch.cat([coordinates.logit.detach()[..., None], coordinates.features], dim=-1)
+    grid = F.interpolate(
+        grid.permute(0, 3, 1, 2), scale_factor=STRIDE // 2, mode="bilinear", align_corners=False
     )
-    grid = F.interpolate(grid, scale_factor=STRIDE // 2, mode="bilinear", align_corners=False)[
-        ..., :rows, :columns
-    ]
+    smooth = grid[..., :rows, :columns].flatten(2).transpose(1, 2).contiguous()
     share = coordinates.log_prob.detach().exp().flatten(1)
     position = coordinates.position.detach().flatten(1, 3)
     shape = (coordinates.logit.shape[1], coordinates.logit.shape[2])
-    return Context(
-        grid.flatten(2).transpose(1, 2).contiguous(),
-        share,
-        position,
-        coordinates.centers,
-        shape,
-        columns,
-    )
+    return Context(smooth, share, position, coordinates.centers, shape, columns)
 
 
 def query(context: Context, u: Tensor, v: Tensor, position: Tensor) -> Tensor:

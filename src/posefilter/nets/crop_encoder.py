@@ -24,10 +24,7 @@ class CropEncoder(nn.Module):
     """
 
     def __init__(
-        self,
-        widths: tuple[int, int, int, int] = (24, 48, 96, 128),
-        code: int = 64,
-        side: int = 48,
+        self, widths: tuple[int, int, int, int] = (24, 48, 96, 128), code: int = 64, side: int = 48
     ) -> None:
         super().__init__()
         self.side, self.width = side, code

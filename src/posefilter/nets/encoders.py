@@ -76,9 +76,7 @@ class PyramidEncoder(nn.Module):
         if self.strides[-1] > side:
             raise UserError(
                 f"model.encoder.levels={len(self.strides)}: a cell of the last would be larger "
-                "than the "
-                f"image; "
-                f"choose {side.bit_length() - 1} or fewer"
+                f"than the image; choose {side.bit_length() - 1} or fewer"
             )
         levels = []
         for stride in self.strides:
@@ -91,11 +89,8 @@ class PyramidEncoder(nn.Module):
         features = []
         for level, stride in zip(maps.levels, maps.strides, strict=True):
             positions = pixels[:, :, None] + patch_offsets(3, pixels.device) * stride
-            features.append(
-                sample(level, positions.flatten(1, 2), stride)
-                .unflatten(1, positions.shape[1:3])
-                .flatten(2)
-            )
+            values = sample(level, positions.flatten(1, 2), stride)
+            features.append(values.unflatten(1, positions.shape[1:3]).flatten(2))
         return torch.cat(features, dim=-1)
 
 

@@ -51,8 +51,7 @@ def applies(device: torch.device) -> bool:
 def missing_context() -> UserError:
     """Return the error of a likelihood with context whose points have none."""
     return UserError(
-        "model/likelihood=contextual reads the proposal network; choose "
-        "model/proposals=dense or "
+        "model/likelihood=contextual reads the proposal network; choose model/proposals=dense or "
         "model/likelihood=pointwise"
     )
 
@@ -173,10 +172,7 @@ def _inputs(
     H, W = image.size
     (B, N), P = poses.shape[:2], noise.shape[2]
     middle, R = origin_of(poses, center), rotation_of(poses)
-    fx, fy, cx, cy = (
-        image.intrinsics[:, row, column, None, None]
-        for row, column in ((0, 0), (1, 1), (0, 2), (1, 2))
-    )
+    fx, fy, cx, cy = image.camera
     pixel = project(middle, image.intrinsics)[..., None]
     reach = (spread * radius * fx[..., 0] / middle[..., 2].clamp_min(0.1))[..., None]
     u = torch.addcmul(pixel[..., 0, :], reach, noise[..., 0]).round_()
@@ -254,15 +250,8 @@ def _asinh_(x: Tensor) -> Tensor:
 def _predict(context: Context, tables: Tables, u: Tensor, v: Tensor, position: Tensor) -> Tensor:
     """Sample fragments' shares and positions at pixels, as `query` does.
 
-    Args:
-        context: The coordinate network's output.
-        tables: Its tables.
-        u: (B, N, P) [px].
-        v: (B, N, P) [px].
-        position: (3, B, N, P) object points of the hypothesis, from the center, in radii.
-
-    Returns:
-        (B, N, P, 4): the share, and the predicted position times the share.
+    (B, N, P) x 2 [px], object points of the hypothesis (3, B, N, P) from the center, in radii ->
+    (B, N, P, 4): the share, and the predicted position times the share.
     """
     (h, w), (B, K) = context.grid, context.centers.shape[:2]
     points = position.flatten(2).permute(1, 2, 0)
@@ -273,9 +262,8 @@ def _predict(context: Context, tables: Tables, u: Tensor, v: Tensor, position: T
     y = ((v + 0.5) / STRIDE - 0.5).clamp_(0, h - 1).flatten(1)
     left, top = x.floor(), y.floor()
     x, y = x.sub_(left), y.sub_(top)
-    columns = [left.long() * K, (left + 1).clamp_max_(w - 1).long() * K]
-    rows = [(top.long() * (w * K)).add_(fragment)]
-    rows.append(((top + 1).clamp_max_(h - 1).long() * (w * K)).add_(fragment))
+    columns = [at.long() * K for at in (left, (left + 1).clamp_max_(w - 1))]
+    rows = [(at.long() * (w * K)).add_(fragment) for at in (top, (top + 1).clamp_max_(h - 1))]
     index = torch.stack([row + column for row in rows for column in columns], dim=-1)
     near = torch.stack([b * a for b in (1 - y, y) for a in (1 - x, x)], dim=-1)
     found: Tensor = torch.nn.functional.embedding_bag(

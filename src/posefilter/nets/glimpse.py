@@ -26,9 +26,7 @@ class IntegerCut(nn.Module):
     def forward(self, image: Tensor, pixels: Tensor) -> Tensor:
         """(B, C, H, W), (B, N, 2) [px] -> (B, N, C, size, size)."""
         index = nearest_pixel(pixels)[:, :, None] + patch_offsets(self.size, pixels.device)
-        patch = gather_pixels(image, index.flatten(1, 2))
-        patch = patch.unflatten(1, index.shape[1:3]).transpose(2, 3)
-        return patch.unflatten(3, (self.size, self.size))
+        return _shape_patches(gather_pixels(image, index.flatten(1, 2)), self.size)
 
 
 class BilinearGlimpse(nn.Module):
@@ -51,6 +49,9 @@ class BilinearGlimpse(nn.Module):
     def forward(self, image: Tensor, pixels: Tensor) -> Tensor:
         """(B, C, H, W), (B, N, 2) [px] -> (B, N, C, size, size)."""
         positions = pixels[:, :, None] + patch_offsets(self.size, pixels.device) * self.spacing
-        patch = sample(image, positions.flatten(1, 2))
-        patch = patch.unflatten(1, positions.shape[1:3]).transpose(2, 3)
-        return patch.unflatten(3, (self.size, self.size))
+        return _shape_patches(sample(image, positions.flatten(1, 2)), self.size)
+
+
+def _shape_patches(values: Tensor, size: int) -> Tensor:
+    """(B, N * size * size, C) -> (B, N, C, size, size)."""
+    return values.unflatten(1, (-1, size * size)).transpose(2, 3).unflatten(3, (size, size))

@@ -48,11 +48,10 @@ class Unbounded(nn.Module):
 
     def __init__(self, unit: str | float = "half_frame") -> None:
         super().__init__()
-        if isinstance(unit, str):
-            known = unit in ("half_frame", "learned")
-        else:
-            known = not isinstance(unit, bool) and 0 < unit < math.inf
-        if not known:
+        length = (
+            isinstance(unit, int | float) and not isinstance(unit, bool) and 0 < unit < math.inf
+        )
+        if unit not in ("half_frame", "learned") and not length:
             raise UserError(
                 f"model.displacement.unit={unit}: choose half_frame, learned, or a number of "
                 "pixels above 0"
@@ -109,10 +108,8 @@ class Gated(nn.Module):
 
     def forward(self, raw: Tensor, logit: Tensor, state: Tensor, width: int, height: int) -> Tensor:
         """(B, N, 2), (B, N), (B, N, 2) [px] -> (B, N, 2) [px]."""
-        return (
-            self.displacement(raw, logit, state, width, height)
-            * torch.sigmoid(-logit.detach())[..., None]
-        )
+        gate = torch.sigmoid(-logit.detach())[..., None]
+        return self.displacement(raw, logit, state, width, height) * gate
 
 
 class _AnyObject(nn.Module):
@@ -240,9 +237,7 @@ class NoPose(_AnyObject):
 
     def forward(self, raw: Tensor, point: Tensor) -> PosePrediction:
         """(B, N, 0), (B, N, 3) [m] -> PosePrediction."""
-        return PosePrediction(
-            make_pose(torch.eye(3, dtype=point.dtype, device=point.device), point)
-        )
+        return PosePrediction(make_pose(torch.eye(3).to(point), point))
 
 
 def fill_depth(depth: Tensor, size: int = 7) -> Tensor:

@@ -42,6 +42,12 @@ class Pixels(NamedTuple):
     tables: Tables | None = None  # of the context, where poses are scored without gradient
     even: bool = False  # whether a pose's image points are drawn evenly instead of independently
 
+    @property
+    def camera(self) -> list[Tensor]:
+        """Focal lengths fx, fy and principal point cx, cy, (B, 1, 1) each [px]."""
+        entries = ((0, 0), (1, 1), (0, 2), (1, 2))
+        return [self.intrinsics[:, row, column, None, None] for row, column in entries]
+
 
 class Points(NamedTuple):
     """The image points of each pose, in that pose's object frame, relative to the object's
@@ -60,16 +66,9 @@ class Points(NamedTuple):
 def flatten_images(
     rgb: Tensor, depth: Tensor, K: Tensor, coordinates: Coordinates | None = None
 ) -> Pixels:
-    """Flatten images for gathering.
+    """Flatten images for gathering, with the coordinate network's output if points have context.
 
-    Args:
-        rgb: (B, 3, H, W) in [0, 1].
-        depth: (B, 1, H, W) [m].
-        K: (B, 3, 3) camera matrices [px].
-        coordinates: Output of the coordinate network, if points have context.
-
-    Returns:
-        The images.
+    (B, 3, H, W) in [0, 1], (B, 1, H, W) [m], (B, 3, 3) [px] -> Pixels.
     """
     H, W = rgb.shape[-2:]
     context = None if coordinates is None else flatten_context(coordinates, H, W)

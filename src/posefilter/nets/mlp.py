@@ -99,12 +99,11 @@ class LatentNet(nn.Module):
             )
         self.displacement_input = displacement_input
         self.latent_width = latent_width
-        self.latent = mlp(
-            4 * size * size + extra + latent_width, latent_width, width, layers, normalization
-        )
-        self.pose = mlp(latent_width, pose_width, width, layers, normalization)
-        self.likelihood = mlp(latent_width, 1, width, layers, normalization)
-        self.displacement = mlp(pose_width + 1 + latent_width, 2, width, layers, normalization)
+        hidden = (width, layers, normalization)
+        self.latent = mlp(4 * size * size + extra + latent_width, latent_width, *hidden)
+        self.pose = mlp(latent_width, pose_width, *hidden)
+        self.likelihood = mlp(latent_width, 1, *hidden)
+        self.displacement = mlp(pose_width + 1 + latent_width, 2, *hidden)
 
     def forward(self, patch: Tensor, extra: Tensor, latent: Tensor) -> NetOutput:
         """(B, N, C, k, k), (B, N, E), (B, N, L) -> NetOutput; C = 4, k = `size`, E = `extra`."""

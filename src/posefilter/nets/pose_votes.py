@@ -19,21 +19,16 @@ def measure_cells(depth: Tensor, K: Tensor) -> Cells:
     h, w = H // STRIDE, W // STRIDE
     blocks = depth[:, 0].unflatten(1, (h, STRIDE)).unflatten(3, (w, STRIDE))
     center = STRIDE // 2
-    choices = [
-        (center - 1, center - 1),
-        (center, center),
-        (center - 1, center),
-        (center, center - 1),
-    ]
+    before = center - 1
     z = torch.zeros(B, h, w, dtype=depth.dtype, device=depth.device)
-    pixel = pixel_grid(H, W, STRIDE, device=depth.device).expand(B, -1, -1, -1).clone()
-    grid0 = pixel_grid(H, W, STRIDE, device=depth.device) - (STRIDE - 1) / 2
-    for row, col in choices:
+    grid = pixel_grid(H, W, STRIDE, device=depth.device)
+    pixel, corner = grid.expand(B, -1, -1, -1), grid - (STRIDE - 1) / 2
+    for row, col in ((before, before), (center, center), (before, center), (center, before)):
         candidate = blocks[:, :, row, :, col]
         take = (z == 0) & (candidate > 0)
         z = torch.where(take, candidate, z)
         offset = torch.tensor([col, row], dtype=depth.dtype, device=depth.device)
-        pixel = torch.where(take[..., None], grid0 + offset, pixel)
+        pixel = torch.where(take[..., None], corner + offset, pixel)
     point = back_project(pixel.flatten(1, 2), z.flatten(1), K).unflatten(1, (h, w))
     return Cells(point, z > 0)
 

@@ -96,10 +96,7 @@ class SurfaceTerm(nn.Module):
         # one product for all poses: (B, N, 3, P)
         at = (R.flatten(0, 2) @ own.T).view(B, N, 3, -1) + t[..., None]
         x, y, z = at.unbind(-2)
-        fx, fy, cx, cy = (
-            image.intrinsics[:, row, column, None, None]
-            for row, column in ((0, 0), (1, 1), (0, 2), (1, 2))
-        )
+        fx, fy, cx, cy = image.camera
         with torch.no_grad():
             over = z.clamp_min(_NEAREST).reciprocal()
             u, v = (fx * x * over + cx).round(), (fy * y * over + cy).round()
