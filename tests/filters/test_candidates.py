@@ -8,12 +8,8 @@ import pytest
 import torch
 from tests.models.toy import scenes, square
 
-from posefilter.filters.candidates import (
-    PersistentParticles,
-    perturb,
-    sample_around_truth,
-    sample_from_depth,
-)
+from posefilter.filters.candidates import PersistentParticles, perturb, sample_around_truth
+from posefilter.filters.initialize import draw_from_depth
 from posefilter.filters.propagate import HalfTurnRotations
 from posefilter.geometry.camera import project
 from posefilter.geometry.pose import make_pose, origin_of
@@ -89,7 +85,7 @@ def test_jitter_has_the_given_size() -> None:
 def test_persistent_particles_follow_their_frame_under_another_camera() -> None:
     batch = scenes(2)._replace(frame_id=torch.tensor([7, 9]))
     kept = PersistentParticles(particles=5, levels=3, sharpest=0.01, step=0.0)
-    fresh = sample_from_depth(batch, SPACE, 5, generator())
+    fresh = draw_from_depth(batch.depth, batch.intrinsics, SPACE, 5, generator())
     poses, sigma = kept.recall(batch, fresh, 0.1)
     torch.testing.assert_close(poses, fresh)
     torch.testing.assert_close(sigma, torch.tensor([0.1, 0.1]))
@@ -98,7 +94,7 @@ def test_persistent_particles_follow_their_frame_under_another_camera() -> None:
     kept.advance(batch, poses, scores, sigma, torch.tensor([True, False]), SPACE, generator(1))
     roll = make_pose(exp_so3(torch.tensor([0.0, 0.0, 0.5])), torch.zeros(3))
     rolled = batch._replace(camera_from_object=roll @ batch.camera_from_object)
-    fresh = sample_from_depth(rolled, SPACE, 5, generator(2))
+    fresh = draw_from_depth(rolled.depth, rolled.intrinsics, SPACE, 5, generator(2))
     again, sigma = kept.recall(rolled, fresh, 0.1)
     torch.testing.assert_close(sigma, torch.tensor([0.1**0.5 * 0.01**0.5, 0.1]))
     torch.testing.assert_close(again[0], (roll @ poses[0, 2]).expand(5, 4, 4), atol=1e-5, rtol=0)
@@ -110,7 +106,9 @@ def test_after_the_last_level_particles_start_anew() -> None:
     kept = PersistentParticles(particles=4, levels=2, sharpest=0.01)
     used = torch.tensor([True])
     for expected in (0.1, 0.01, 0.1):
-        poses, sigma = kept.recall(batch, sample_from_depth(batch, SPACE, 4, generator()), 0.1)
+        poses, sigma = kept.recall(
+            batch, draw_from_depth(batch.depth, batch.intrinsics, SPACE, 4, generator()), 0.1
+        )
         torch.testing.assert_close(sigma, torch.tensor([expected]))
         kept.advance(batch, poses, torch.zeros(1, 4), sigma, used, SPACE, generator())
 
@@ -120,7 +118,7 @@ def test_a_resumed_run_has_the_same_particles_and_levels() -> None:
     kept, resumed = (PersistentParticles(particles=3, levels=4, sharpest=0.01) for _ in range(2))
     assert kept.state() == {}
     both = torch.tensor([True, True])
-    fresh = sample_from_depth(batch, SPACE, 3, generator())
+    fresh = draw_from_depth(batch.depth, batch.intrinsics, SPACE, 3, generator())
     for used in (both, torch.tensor([False, True])):
         poses, sigma = kept.recall(batch, fresh, 0.08)
         kept.advance(batch, poses, torch.zeros(2, 3), sigma, used, SPACE, generator(1))
@@ -142,7 +140,10 @@ def test_a_resumed_run_has_the_same_particles_and_levels() -> None:
 def test_after_the_last_level_a_frames_own_particles_are_gone() -> None:
     batch = scenes(1)
     kept = PersistentParticles(particles=4, levels=2, sharpest=0.01)
-    fresh = [sample_from_depth(batch, SPACE, 4, generator(seed)) for seed in range(3)]
+    fresh = [
+        draw_from_depth(batch.depth, batch.intrinsics, SPACE, 4, generator(seed))
+        for seed in range(3)
+    ]
     found = []
     for one in fresh:
         poses, sigma = kept.recall(batch, one, 0.1)

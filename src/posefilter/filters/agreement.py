@@ -8,7 +8,7 @@ from torch import Generator, Tensor
 
 from posefilter.capabilities import Capabilities
 from posefilter.errors import UserError
-from posefilter.geometry.pose import fit_rigid, invert, transform
+from posefilter.geometry.pose import fit_rigid, invert, take_poses, transform
 from posefilter.geometry.votes import draw_votes
 from posefilter.protocols import Encoding, HasSurfacePoints, Method
 from posefilter.types import BeliefBatch, ParticleOutput, Particles
@@ -79,8 +79,7 @@ class Agreement:
         )
         weight = weight + 1e-9  # where none is known, all are
         top = weight.topk(min(self.hypotheses, weight.shape[1]), dim=1).indices
-        top_poses = output.pose.detach().gather(1, top[..., None, None].expand(-1, -1, 4, 4))
-        hypotheses = torch.cat([votes, top_poses], dim=1)
+        hypotheses = torch.cat([votes, take_poses(output.pose.detach(), top)], dim=1)
         object_point = center + radius * position
         fit = self._inliers(hypotheses, object_point[:, None], point[:, None], 2 * self.scale_m)
         support = (weight[:, None] * (share[:, None] * fit).sum(-1)).sum(-1)
@@ -92,12 +91,10 @@ class Agreement:
             best = fit_rigid(chosen, point, weight * fit)
         # a weight of 0.04 is a residual of two scales
         agreeing = (share * (self._inliers(best, object_point, point, self.scale_m) > 0.04)).sum(-1)
-        score = (
-            (weight * agreeing).sum(1) / weight.sum(1) * output.log_likelihood.exp().max(1).values
-        )
-        log_weights = torch.log_softmax(
-            self.effective_particles * support[:, : self.hypotheses].clamp_min(1e-30).log(), dim=1
-        )
+        agreed = (weight * agreeing).sum(1) / weight.sum(1)
+        score = agreed * output.log_likelihood.exp().max(1).values
+        log_support = support[:, : self.hypotheses].clamp_min(1e-30).log()
+        log_weights = (self.effective_particles * log_support).log_softmax(1)
         return BeliefBatch(votes, log_weights, best, score)
 
     def list_object_points(
@@ -112,25 +109,17 @@ class Agreement:
         if fragments is None:
             object_point = transform(invert(output.pose.detach()), point[:, :, None])
             return torch.ones_like(object_point[..., 0]), (object_point - center) / radius
-        log_prob, fragment = fragments.log_prob.detach().topk(
-            min(self.top_fragments, fragments.log_prob.shape[-1]), dim=-1
-        )
-        return log_prob.exp(), fragments.position.detach().gather(
-            2, fragment[..., None].expand(-1, -1, -1, 3)
-        )
+        count = min(self.top_fragments, fragments.log_prob.shape[-1])
+        log_prob, index = fragments.log_prob.detach().topk(count, dim=-1)
+        index = index[..., None].expand(-1, -1, -1, 3)
+        return log_prob.exp(), fragments.position.detach().gather(2, index)
 
     @staticmethod
     def _inliers(pose: Tensor, object_point: Tensor, point: Tensor, scale: float) -> Tensor:
         """Return the Geman-McClure weight of each correspondence under each pose.
 
-        Args:
-            pose: (*, 4, 4) camera_from_object [m].
-            object_point: (*, N, k, 3) in the object's frame [m].
-            point: (*, N, 3) measured, in the camera [m].
-            scale: Scale of the residuals [m].
-
-        Returns:
-            Weights (*, N, k) in (0, 1].
+        (*, 4, 4), object points (*, N, k, 3), measured points in the camera (*, N, 3), the scale of
+        the residuals [m] -> (*, N, k) in (0, 1].
         """
         points = transform(pose, object_point.flatten(-3, -2))
         offset = points.unflatten(-2, object_point.shape[-3:-1]) - point[..., None, :]

@@ -14,36 +14,21 @@ from torch import Generator, Tensor, nn
 
 from posefilter.errors import UserError
 from posefilter.filters.initialize import draw_from_depth
-from posefilter.geometry.pose import invert, origin_of, pose_about
+from posefilter.geometry.pose import invert, origin_of, pose_about, take_poses
 from posefilter.geometry.rotation import random_rotation
 from posefilter.geometry.spaces import PoseSpace
 from posefilter.protocols import Propagate
 from posefilter.types import Batch, ObjectModel, Step
 
 
-def sample_from_depth(
-    batch: Batch, space: PoseSpace, count: int, generator: Generator, prior: Tensor | None = None
-) -> Tensor:
-    """Draw poses at measured points of a batch; see `draw_from_depth`.  -> (B, count, 4, 4)."""
-    return draw_from_depth(batch.depth, batch.intrinsics, space, count, generator, prior)
-
-
 def perturb(poses: Tensor, sigma: Tensor, space: PoseSpace, generator: Generator) -> Tensor:
     """Perturb poses by Gaussian noise in the space's tangent.
 
-    Args:
-        poses: (B, N, 4, 4) camera_from_object.
-        sigma: (B, N) noise level [m].
-        space: The space of the poses.
-        generator: Source of randomness.
-
-    Returns:
-        Perturbed poses (B, N, 4, 4).
+    (B, N, 4, 4), noise levels (B, N) [m] -> (B, N, 4, 4).
     """
     scale = space.noise_scale(sigma)
-    return space.move(
-        poses, scale * torch.randn(scale.shape, generator=generator, device=poses.device)
-    )
+    noise = torch.randn(scale.shape, generator=generator, device=poses.device)
+    return space.move(poses, scale * noise)
 
 
 def sample_around_truth(
@@ -79,20 +64,16 @@ def sample_around_truth(
     truth = batch.camera_from_object[:, None]
     center = object_model.center.to(device)
     low, high = math.log(sigma[0]), math.log(sigma[1])
-    size = torch.exp(
-        torch.empty(B, per_kind, device=device).uniform_(low, high, generator=generator)
-    )
+    size = torch.empty(B, per_kind, device=device).uniform_(low, high, generator=generator).exp()
     copies = truth.expand(B, per_kind, 4, 4)
     nearby = perturb(copies, size * 0.6, space, generator)
-    on_object = sample_from_depth(batch, space, per_kind, generator, batch.mask.float() + 0.02)
-    anywhere = sample_from_depth(batch, space, per_kind, generator)
+    seen = batch.depth, batch.intrinsics, space, per_kind, generator
+    on_object = draw_from_depth(*seen, batch.mask.float() + 0.02)
+    anywhere = draw_from_depth(*seen)
     half = per_kind // 2
     shifted = perturb(truth.expand(B, half, 4, 4), size[:, :half] * 0.5, space, generator)
-    rotated = pose_about(
-        random_rotation(B, half, generator=generator, device=device),
-        origin_of(shifted, center),
-        center,
-    )
+    any_rotation = random_rotation(B, half, generator=generator, device=device)
+    rotated = pose_about(any_rotation, origin_of(shifted, center), center)
     still = copies.new_zeros(B, per_kind, space.dimensions)
     turned = rotations(copies, still, Step(0, 1, size[:, 0]), space, generator)
     flipped = perturb(turned, size * 0.3, space, generator)
@@ -123,8 +104,7 @@ class PersistentParticles(nn.Module):
         if particles < 1 or levels < 2:
             raise UserError(
                 f"model.candidate_sampler: sigma_levels={levels} must be 2 or more, "
-                f"particles={particles} 1 "
-                f"or more, or 0 for none"
+                f"particles={particles} 1 or more, or 0 for none"
             )
         self.particles, self.levels, self.sharpest, self.step = particles, levels, sharpest, step
         self._poses: dict[int, Tensor] = {}
@@ -141,17 +121,12 @@ class PersistentParticles(nn.Module):
         Returns:
             Particles (B, M, 4, 4) camera_from_object, and noise levels (B,) [m].
         """
-        rows = []
-        for row, frame in enumerate(batch.frame_id.tolist()):
-            stored = self._poses.get(frame)
-            rows.append(
-                fresh[row]
-                if stored is None
-                else batch.camera_from_object[row] @ stored.to(fresh.device)
-            )
-        level = torch.tensor(
-            [self._level.get(frame, 0) for frame in batch.frame_id.tolist()], device=fresh.device
-        )
+        frames, rows = batch.frame_id.tolist(), list(fresh)
+        for row, frame in enumerate(frames):
+            if frame in self._poses:
+                stored = self._poses[frame].to(fresh.device)
+                rows[row] = batch.camera_from_object[row] @ stored
+        level = torch.tensor([self._level.get(frame, 0) for frame in frames], device=fresh.device)
         return torch.stack(rows), start * (self.sharpest / start) ** (level / (self.levels - 1))
 
     def state(self) -> dict[str, Tensor]:
@@ -203,11 +178,9 @@ class PersistentParticles(nn.Module):
         ancestors = torch.multinomial(
             torch.softmax(scores, dim=1), self.particles, replacement=True, generator=generator
         )
-        resampled = poses.gather(1, ancestors[..., None, None].expand(-1, -1, 4, 4))
         size = (self.step * sigma)[:, None].expand(-1, self.particles)
-        relative = invert(batch.camera_from_object)[:, None] @ perturb(
-            resampled, size, space, generator
-        )
+        moved = perturb(take_poses(poses, ancestors), size, space, generator)
+        relative = invert(batch.camera_from_object)[:, None] @ moved
         for row, frame in enumerate(batch.frame_id.tolist()):
             if not bool(used[row]):
                 continue

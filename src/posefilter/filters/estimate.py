@@ -84,14 +84,12 @@ class Mean:
         generator: Generator,
     ) -> BeliefBatch:
         """Return the belief; differentiable in weights and poses."""
-        space = (
-            method.space if isinstance(method.space, PoseSpace) else PoseSpace((0.0, 0.0, 0.0), 1.0)
-        )
+        own = method.space
+        space = own if isinstance(own, PoseSpace) else PoseSpace((0.0, 0.0, 0.0), 1.0)
         weights = particles.log_weights.exp()
         weighted = torch.where(weights > 0, weights * output.log_likelihood, 0.0)
-        return BeliefBatch(
-            output.pose, particles.log_weights, space.mean(output.pose, weights), weighted.sum(1)
-        )
+        mean = space.mean(output.pose, weights)
+        return BeliefBatch(output.pose, particles.log_weights, mean, weighted.sum(1))
 
 
 def kernel_mass(
@@ -113,9 +111,8 @@ def kernel_mass(
     parts = []
     for block in state.split(rows, dim=1):
         distance = space.distance(block[:, :, None], state[:, None])
-        parts.append(
-            torch.logsumexp(log_weights[:, None] - 0.5 * (distance / bandwidth).square(), dim=2)
-        )
+        log_kernel = -0.5 * (distance / bandwidth).square()
+        parts.append((log_weights[:, None] + log_kernel).logsumexp(2))
     return torch.cat(parts, dim=1)
 
 

@@ -96,14 +96,8 @@ class FromDepth:
         """Return (B, N, 4, 4) [m]."""
         space = method.space
         assert isinstance(space, PoseSpace)  # of what `requires` says
-        return draw_from_depth(
-            batch.depth,
-            batch.intrinsics,
-            space,
-            particles,
-            generator,
-            depth_offset=self.depth_offset,
-        )
+        seen, offset = (batch.depth, batch.intrinsics), self.depth_offset
+        return draw_from_depth(*seen, space, particles, generator, depth_offset=offset)
 
 
 class FromObjectness:
@@ -125,15 +119,13 @@ class FromObjectness:
         """Return (B, N, 2) [px], uniform within each drawn cell."""
         weight = encoding.objectness[:, 0].detach()
         weight = weight / weight.sum((1, 2), keepdim=True).clamp_min(1e-12)
-        weight = (1 - self.uniform_fraction) * weight + max(self.uniform_fraction, 1e-6) / weight[
-            0
-        ].numel()
+        even = max(self.uniform_fraction, 1e-6) / weight[0].numel()
+        weight = (1 - self.uniform_fraction) * weight + even
         cell = draw_cells(weight, particles, generator)
         H, W = batch.rgb.shape[-2:]
         size = weight.new_tensor([W / weight.shape[2], H / weight.shape[1]])
-        return (
-            cell + torch.rand(cell.shape, generator=generator, device=weight.device)
-        ) * size - 0.5
+        within = torch.rand(cell.shape, generator=generator, device=weight.device)
+        return (cell + within) * size - 0.5
 
 
 class FromProposals:

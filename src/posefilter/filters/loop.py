@@ -167,9 +167,8 @@ class ParticleFilter(nn.Module):
                 displacement = inherit(output.displacement, resampled)
                 state = self.propagate(state, displacement, step, method.space, generator)
                 latent = inherit(output.latent, resampled)
-                ancestor_log_likelihood = inherit(output.log_likelihood[..., None], resampled)[
-                    ..., 0
-                ]
+                before = inherit(output.log_likelihood[..., None], resampled)
+                ancestor_log_likelihood = before[..., 0]
                 particles = Particles(state, latent, resampled.log_weights, resampled.ancestors)
             output = method.measure(encoding, particles, step, generator)
             log_weights = self.reweight(
@@ -249,7 +248,6 @@ def check_finite(log_evidence: Tensor) -> None:
         image, step = failed.nonzero()[0].tolist()
         raise FloatingPointError(
             f"the particle filter failed at step {step} (image {image} of the batch): the log "
-            f"weights sum to "
-            f"{log_evidence[image, step].item()}, so the likelihood is not finite or zero "
-            f"everywhere"
+            f"weights sum to {log_evidence[image, step].item()}, so the likelihood is not finite "
+            f"or zero everywhere"
         )

@@ -9,6 +9,7 @@ from torch import Generator, Tensor
 
 from posefilter.capabilities import Capabilities
 from posefilter.errors import UserError
+from posefilter.geometry.pose import take_poses
 from posefilter.protocols import Encoding, HasObject, Method, Refine, ScoresPoses
 from posefilter.types import BeliefBatch, ObjectModel
 
@@ -64,16 +65,13 @@ def object_of(method: Method) -> ObjectModel:
 def top_poses(belief: BeliefBatch, count: int) -> Tensor:
     """Return the estimate and the `count` particles of highest weight.  -> (B, 1 + count, 4, 4)."""
     top = belief.log_weights.topk(min(count, belief.log_weights.shape[1]), dim=1).indices
-    rows = torch.arange(len(top), device=top.device)[:, None]
-    return torch.cat([belief.best[:, None], belief.poses[rows, top]], dim=1)
+    return torch.cat([belief.best[:, None], take_poses(belief.poses, top)], dim=1)
 
 
 def select_best(belief: BeliefBatch, poses: Tensor, scores: Tensor) -> BeliefBatch:
     """Return the belief with the pose of highest score as its estimate.  (B, C, 4, 4), (B, C)."""
     score, index = scores.max(1)
-    return belief._replace(
-        best=poses[torch.arange(len(index), device=index.device), index], score=score
-    )
+    return belief._replace(best=take_poses(poses, index[:, None])[:, 0], score=score)
 
 
 @dataclass(eq=False)
@@ -154,9 +152,8 @@ class MeanShift:
             shape = (len(best), self.antithetic_pairs, method.space.dimensions)
             noise = torch.randn(shape, generator=generator, device=best.device, dtype=best.dtype)
             moves = torch.cat([noise, -noise], dim=1) * scale
-            poses = method.space.move(
-                best[:, None].expand(-1, 2 * self.antithetic_pairs, -1, -1), moves
-            )
+            copies = best[:, None].expand(-1, 2 * self.antithetic_pairs, -1, -1)
+            poses = method.space.move(copies, moves)
             scores = scorer.score_poses(encoding, poses, self.sigma, generator, self.pixels)
             best = method.space.move(best, (scores.softmax(1)[..., None] * moves).sum(1))
         score = scorer.score_poses(encoding, best[:, None], self.sigma, generator, self.pixels)

@@ -120,9 +120,8 @@ class Soft:
         log_w = particles.log_weights
         mixed = self.alpha * log_w.detach().exp() + (1 - self.alpha) / log_w.shape[1]
         log_q = mixed.clamp_min(torch.finfo(mixed.dtype).tiny).log()
-        ancestors = self.scheme(
-            particles._replace(log_weights=log_q), count, space, generator
-        ).ancestors
+        drawn = self.scheme(particles._replace(log_weights=log_q), count, space, generator)
+        ancestors = drawn.ancestors
         ratio = (log_w - log_q).gather(1, ancestors)
         # where the weights of all that were drawn are 0, they are equal
         ratio = ratio.clamp_min(0.5 * torch.finfo(ratio.dtype).min)
@@ -146,9 +145,8 @@ class NoResampling:
                 f"filter/resample=none cannot turn {M} particles into {count}: leave "
                 f"filter.initial_particles out"
             )
-        return Resampled(
-            torch.arange(M, device=particles.state.device).expand(B, M), particles.log_weights
-        )
+        ancestors = torch.arange(M, device=particles.state.device).expand(B, M)
+        return Resampled(ancestors, particles.log_weights)
 
 
 class AdaptiveResampling:
@@ -177,15 +175,11 @@ class AdaptiveResampling:
         kept = NoResampling()(particles, count, space, generator)
         mixture_weights = new.mixture_weights
         if mixture_weights is not None:
-            mixture_weights = torch.where(
-                low[..., None],
-                mixture_weights,
-                torch.eye(M, dtype=mixture_weights.dtype, device=mixture_weights.device),
-            )
+            itself = torch.eye(M).to(mixture_weights)
+            mixture_weights = torch.where(low[..., None], mixture_weights, itself)
         ancestors = torch.where(low, new.ancestors, kept.ancestors)
-        return Resampled(
-            ancestors, torch.where(low, new.log_weights, kept.log_weights), mixture_weights
-        )
+        log_weights = torch.where(low, new.log_weights, kept.log_weights)
+        return Resampled(ancestors, log_weights, mixture_weights)
 
 
 class Islands:

@@ -24,7 +24,8 @@ from posefilter.capabilities import Capabilities
 from posefilter.errors import UserError
 from posefilter.filters.propagate import AxisRotations
 from posefilter.filters.refine import scorer_of
-from posefilter.filters.resample import inverse_cdf
+from posefilter.filters.resample import Systematic, inverse_cdf
+from posefilter.geometry.pose import take_poses
 from posefilter.geometry.pose_statistics import twist_between
 from posefilter.geometry.spaces import PoseSpace
 from posefilter.protocols import Encoding, Method
@@ -103,9 +104,8 @@ class ResampleMove:
             )
             return found.double() / self.temperature
 
-        offset = torch.rand(B, 1, generator=generator, device=device)
-        strata = (torch.arange(N, device=device) + offset) / N
-        poses = take(belief.poses.double(), inverse_cdf(belief.log_weights, strata))
+        strata = Systematic().uniforms(B, N, generator, device)
+        poses = take_poses(belief.poses.double(), inverse_cdf(belief.log_weights, strata))
         log_target = score(poses)
         for _ in range(self.sweeps):
             poses, log_target = self.sweep(poses, log_target, score, space, generator)
@@ -122,18 +122,11 @@ class ResampleMove:
     ) -> tuple[Tensor, Tensor]:
         """Propose one step of each particle, first of one half, then of the other.
 
-        Args:
-            poses: (B, N, 4, 4).
-            log_target: (B, N), the target's log density at them.
-            score: (B, M, 4, 4) -> (B, M), the target's log density.
-            space: The space of the poses.
-            generator: Source of randomness.
-
-        Returns:
-            The same after the sweep, shuffled.
+        (B, N, 4, 4), (B, N) the target's log density at them, which `score` computes -> the same
+        after the sweep, shuffled.
         """
         order = torch.rand(log_target.shape, generator=generator, device=poses.device).argsort(1)
-        poses, log_target = take(poses, order), log_target.gather(1, order)
+        poses, log_target = take_poses(poses, order), log_target.gather(1, order)
         half = poses.shape[1] // 2
         for own, others in ((slice(half), slice(half, None)), (slice(half, None), slice(half))):
             proposed = self.propose(poses[:, own], poses[:, others], space, generator)
@@ -161,14 +154,8 @@ def draw_differences(poses: Tensor, count: int, space: PoseSpace, generator: Gen
     For each a share s is drawn, its logarithm uniform, then one of the share s of the pairs that
     are nearest to each other.
 
-    Args:
-        poses: (B, M, 4, 4).
-        count: Number of twists.
-        space: Of the poses; its distance tells what is near.
-        generator: Source of randomness.
-
-    Returns:
-        Twists (B, count, 6); zeros where there are fewer than two poses.
+    (B, M, 4, 4) -> (B, count, 6); zeros where there are fewer than two poses.  The distance of
+    `space` tells what is near.
     """
     poses = poses[:, :_MOST_PARTNERS]
     B, M = poses.shape[:2]
@@ -183,9 +170,5 @@ def draw_differences(poses: Tensor, count: int, space: PoseSpace, generator: Gen
     swap = chance[2] < 0.5
     start = torch.where(swap, second[pair], first[pair])
     end = torch.where(swap, first[pair], second[pair])
-    return twist_between(take(poses, start), take(poses, end), poses.new_tensor(space.center))
-
-
-def take(poses: Tensor, index: Tensor) -> Tensor:
-    """Return some of each image's poses.  (B, N, 4, 4), (B, M) -> (B, M, 4, 4)."""
-    return poses.gather(1, index[..., None, None].expand(-1, -1, 4, 4))
+    start, end = take_poses(poses, start), take_poses(poses, end)
+    return twist_between(start, end, poses.new_tensor(space.center))

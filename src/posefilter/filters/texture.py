@@ -386,13 +386,11 @@ class TextureRotations:
         beside = angles.topk(_BESIDE, dim=1, largest=False).indices  # itself first
         near = beside[top]  # (B, M, _BESIDE)
         around = best[:, None, None] @ turns[near]
-        fine = measure_texture(around.flatten(1, 2), encoding, object_model, shift=0).unflatten(
-            1, (_MOST, -1)
-        )
-        chosen[rows, top] = near.gather(2, fine.argmax(2, keepdim=True))[..., 0]
-        evidence[rows, top] = measure_texture(
-            best[:, None] @ turns[chosen[rows, top]], encoding, object_model
-        )
+        fine = measure_texture(around.flatten(1, 2), encoding, object_model, shift=0)
+        finest = fine.unflatten(1, (_MOST, -1)).argmax(2, keepdim=True)
+        chosen[rows, top] = near.gather(2, finest)[..., 0]
+        poses = best[:, None] @ turns[chosen[rows, top]]
+        evidence[rows, top] = measure_texture(poses, encoding, object_model)
         return evidence + learned, chosen
 
     def _rotate_finely(

@@ -67,9 +67,8 @@ class SampledTransport:
         children's weights, so means are kept.
         """
         M = particles.state.shape[1]
-        targets = particles.state[
-            :, torch.linspace(0, M - 1, count, device=particles.state.device).round().long()
-        ]
+        every = torch.linspace(0, M - 1, count, device=particles.state.device).round().long()
+        targets = particles.state[:, every]
         cost = space.distance(targets[:, :, None], particles.state[:, None]).square()
         cost = cost / cost.mean((1, 2), keepdim=True).clamp_min(1e-12)
         # the potential of a particle without weight would be infinite

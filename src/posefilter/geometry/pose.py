@@ -37,9 +37,12 @@ def invert(a_from_b: Tensor) -> Tensor:
 
 def transform(a_from_b: Tensor, points_b: Tensor) -> Tensor:
     """Map points of frame b into frame a.  (*, 4, 4), (*, P, 3) [m] -> (*, P, 3) [m]."""
-    return (
-        points_b @ rotation_of(a_from_b).transpose(-1, -2) + translation_of(a_from_b)[..., None, :]
-    )
+    return points_b @ rotation_of(a_from_b).mT + translation_of(a_from_b)[..., None, :]
+
+
+def take_poses(poses: Tensor, index: Tensor) -> Tensor:
+    """Return some of each image's poses.  (B, N, 4, 4), (B, M) int64 -> (B, M, 4, 4)."""
+    return poses.gather(1, index[..., None, None].expand(-1, -1, 4, 4))
 
 
 def origin_of(pose: Tensor, point: Tensor) -> Tensor:

@@ -8,12 +8,9 @@ from torch import Generator, Tensor
 
 from posefilter.capabilities import Capabilities
 from posefilter.errors import check_range
-from posefilter.filters.candidates import (
-    PersistentParticles,
-    sample_around_truth,
-    sample_from_depth,
-)
+from posefilter.filters.candidates import PersistentParticles, sample_around_truth
 from posefilter.filters.estimate import select_particle
+from posefilter.filters.initialize import draw_from_depth
 from posefilter.filters.loop import make_particles
 from posefilter.filters.propagate import HalfTurnRotations
 from posefilter.geometry.camera import back_project, rays
@@ -117,15 +114,10 @@ class CandidatePoses(CandidateSampler):
         object_model = method.object_model
         low, high = math.log(self.sigma_range[0]), math.log(self.sigma_range[1])
         sigma = torch.exp(torch.empty(B, device=device).uniform_(low, high, generator=generator))
+        space, per_kind = method.space, self.candidates_per_kind
         groups = [
             sample_around_truth(
-                batch,
-                object_model,
-                method.space,
-                self.candidates_per_kind,
-                self.sigma_range,
-                generator,
-                self.rotations,
+                batch, object_model, space, per_kind, self.sigma_range, generator, self.rotations
             )
         ]
         proposes = "propose_poses" in method.capabilities
@@ -133,26 +125,22 @@ class CandidatePoses(CandidateSampler):
             groups.append(method.propose_poses(encoding, self.proposals, generator))
         own = torch.zeros(B, dtype=torch.bool, device=device)
         if self.persistent is not None:
-            count, space = self.persistent.particles, method.space
-            fresh = (
-                method.propose_poses(encoding, count, generator)
-                if proposes
-                else sample_from_depth(batch, space, count, generator)
-            )
-            states, level = self.persistent.recall(
-                batch, fresh, self.initial_sigma if proposes else self.sigma_range[1]
-            )
-            own = (
-                torch.rand(B, device=device, generator=generator)
-                < self.persistent_sigma_probability
-            )
+            count = self.persistent.particles
+            if proposes:
+                fresh, start = method.propose_poses(encoding, count, generator), self.initial_sigma
+            else:
+                fresh = draw_from_depth(batch.depth, batch.intrinsics, space, count, generator)
+                start = self.sigma_range[1]
+            states, level = self.persistent.recall(batch, fresh, start)
+            chance = torch.rand(B, device=device, generator=generator)
+            own = chance < self.persistent_sigma_probability
             sigma = torch.where(own, level, sigma)
             groups.append(states)
         particles = make_particles(torch.cat(groups, dim=1), 0)
         output = method.measure(encoding, particles, Step(0, 1, sigma), generator)
         if self.persistent is not None:
             scores = output.log_likelihood[:, -self.persistent.particles :].detach()
-            self.persistent.advance(batch, groups[-1], scores, sigma, own, method.space, generator)
+            self.persistent.advance(batch, states, scores, sigma, own, space, generator)
         return one_step_trace(particles, output, sigma)
 
     def state(self) -> dict[str, Tensor]:
@@ -232,9 +220,8 @@ class LabeledRays(CandidateSampler):
         pixel = torch.stack([pick % W, pick // W], dim=-1).float()
         z = depth.gather(1, pick)[..., None]
         fraction = torch.linspace(0, 1, self.samples, device=device)
-        at = (
-            self.min_depth + (z + self.margin_behind - self.min_depth) * fraction
-        )  # (B, rays, samples) z-depth [m]
+        # (B, rays, samples) z-depth [m]
+        at = self.min_depth + (z + self.margin_behind - self.min_depth) * fraction
         length = rays(pixel, batch.intrinsics).norm(dim=-1, keepdim=True)
         offset = ((at - z) * length).flatten(1)
         pixel = pixel[:, :, None].expand(-1, -1, self.samples, -1).flatten(1, 2)
@@ -255,7 +242,6 @@ class LabeledRays(CandidateSampler):
         log_weights = (weight / weight.sum(1, keepdim=True).clamp_min(1)).log()
         particles = make_particles(torch.cat(state, dim=1), 0)._replace(log_weights=log_weights)
         pose = batch.camera_from_object[:, None].expand(-1, scores.shape[1], -1, -1)
-        output = ParticleOutput(
-            scores, scores.new_zeros(B, scores.shape[1], 6), pose, particles.latent
-        )
+        no_move = scores.new_zeros(B, scores.shape[1], 6)
+        output = ParticleOutput(scores, no_move, pose, particles.latent)
         return one_step_trace(particles, output, torch.full((B,), self.tolerance, device=device))
