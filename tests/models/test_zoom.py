@@ -162,10 +162,10 @@ def test_a_batch_of_all_kinds_keeps_its_places_about_a_center_that_is_not_the_or
     """Small and agreed, large, small by the whole filter's answer alone, large again."""
     agreed = zoom.find_place
 
-    def find_place(particles: Particles, object_model: ObjectModel) -> zoom.Place:
+    def find_place(particles: Particles, object_model: ObjectModel) -> tuple[Tensor, Tensor]:
         center, weight = agreed(particles, object_model)
         disagreed = torch.tensor([False, False, True, False])
-        return zoom.Place(torch.where(disagreed[:, None], 0.1, center), weight * ~disagreed)
+        return torch.where(disagreed[:, None], 0.1, center), weight * ~disagreed
 
     monkeypatch.setattr(zoom, "find_place", find_place)
     batch = draw((27, 22, 0.5), (40, 30, 0.25), (34, 25, 0.6), (50, 10, 0.2))

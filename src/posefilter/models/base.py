@@ -40,15 +40,7 @@ from posefilter.models.lr_schedulers import find_length
 from posefilter.models.quantization import unpack_object
 from posefilter.models.zoom import choose_part, search
 from posefilter.protocols import Loss, Space
-from posefilter.types import (
-    Batch,
-    BeliefBatch,
-    ObjectModel,
-    ParticleOutput,
-    Particles,
-    Step,
-    Trace,
-)
+from posefilter.types import Batch, BeliefBatch, ObjectModel, ParticleOutput, Particles, Step, Trace
 
 if TYPE_CHECKING:
     from lightning import LightningModule as Module
@@ -315,9 +307,8 @@ class PoseEstimator(Module):
 
         The default is the chosen loss of one roll-out.
         """
-        return {
-            "loss": self.loss(self.train_filter(batch, self, generator), batch, self.object_model)
-        }
+        trace = self.train_filter(batch, self, generator)
+        return {"loss": self.loss(trace, batch, self.object_model)}
 
     def training_step(self, batch: Batch, batch_number: int) -> Tensor:
         """Return the sum of the losses' means, the loss that is minimized.
@@ -349,9 +340,8 @@ class PoseEstimator(Module):
 
     def configure_optimizers(self) -> Any:
         """Build the optimizer and its schedule over the run's steps."""
-        optimizer = self.make_optimizer(
-            (name, p) for name, p in self.named_parameters() if p.requires_grad
-        )
+        named = ((name, p) for name, p in self.named_parameters() if p.requires_grad)
+        optimizer = self.make_optimizer(named)
         if self.make_scheduler is None:
             return optimizer
         length = find_length(self.make_scheduler)
@@ -363,10 +353,8 @@ class PoseEstimator(Module):
             )
         steps = int(expected)
         scheduler = self.make_scheduler(optimizer, **({length: steps} if length else {}))
-        return {
-            "optimizer": optimizer,
-            "lr_scheduler": {"scheduler": scheduler, "interval": "step"},
-        }
+        every_step = {"scheduler": scheduler, "interval": "step"}
+        return {"optimizer": optimizer, "lr_scheduler": every_step}
 
     def configure_gradient_clipping(
         self,
@@ -453,9 +441,8 @@ class PoseEstimator(Module):
             batch.camera_from_object, self.object_model.hull, batch.intrinsics, height, width
         )
         self.scores["iou"].update(self.box(trace, batch), truth)
-        self.scores["particles_on_object"].update(
-            batch.mask, self.particle_pixels(trace.particles[-1], batch)
-        )
+        pixels = self.particle_pixels(trace.particles[-1], batch)
+        self.scores["particles_on_object"].update(batch.mask, pixels)
         best, true_pose = trace.belief.best, batch.camera_from_object
         self.last_belief = trace.belief
         if "poses" in self.scores:
@@ -504,9 +491,8 @@ class PoseEstimator(Module):
             right = self.pose_tolerance.accepts(errors)
         verdict = score_verdicts(found, self.costs)
         if size is not None:  # of a wrong size none is found
-            verdict = torch.where(
-                size.contradicts().to(verdict.device), verdict.clamp_max(0), verdict
-            )
+            wrong = size.contradicts().to(verdict.device)
+            verdict = torch.where(wrong, verdict.clamp_max(0), verdict)
         rgb, depth = batch.rgb.permute(0, 2, 3, 1).contiguous().cpu(), batch.depth[:, 0].cpu()
         pairs = zip(rgb.numpy(), depth.numpy(), strict=True)
         blank = torch.tensor([bool(find_blank(*pair)) for pair in pairs])
@@ -530,10 +516,8 @@ class PoseEstimator(Module):
         """
         if not isinstance(self.space, PoseSpace):
             return particles.state
-        return project(
-            origin_of(particles.state, self.object_model.center.to(particles.state.device)),
-            batch.intrinsics,
-        )
+        center = self.object_model.center.to(particles.state.device)
+        return project(origin_of(particles.state, center), batch.intrinsics)
 
     def compute_metrics(self) -> dict[str, Any]:
         """Return the metrics since the last reset, in the form of metrics.json."""

@@ -20,9 +20,9 @@ def clip_submodules(module: nn.Module, limit: float | None) -> list[str]:
     skipped = []
     for name, part in module.named_children():
         parameters = [p for p in part.parameters() if p.grad is not None]
-        if parameters and not bool(
-            nn.utils.clip_grad_norm_(parameters, limit or math.inf).isfinite()
-        ):
+        if not parameters:
+            continue
+        if not bool(nn.utils.clip_grad_norm_(parameters, limit or math.inf).isfinite()):
             skipped.append(name)
             for parameter in parameters:
                 parameter.grad = None  # zeros would still move it, by momentum

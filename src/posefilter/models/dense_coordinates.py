@@ -12,12 +12,7 @@ import torch
 from torch import Generator, Tensor
 
 from posefilter.capabilities import Capabilities
-from posefilter.geometry.ransac import (
-    agreement,
-    draw_minimal_fits,
-    refit_to_inliers,
-    weigh_inliers,
-)
+from posefilter.geometry.ransac import agreement, draw_minimal_fits, refit_to_inliers, weigh_inliers
 from posefilter.models.pose_particles import Hypotheses, require_depth
 from posefilter.nets.coordinates import Cells, Coordinates
 from posefilter.nets.pose_votes import measure_cells

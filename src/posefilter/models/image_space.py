@@ -107,11 +107,8 @@ class ImageSpace(PoseEstimator):
         self.encoder = encoder
         self.pose_head = pose_head
         self.displacement = displacement
-        self.net = net(
-            extra=self.encoder.width + self.position_width,
-            size=glimpse.size,
-            pose_width=self.pose_head.width,
-        )
+        extra = self.encoder.width + self.position_width
+        self.net = net(extra=extra, size=glimpse.size, pose_width=self.pose_head.width)
         self.box_head = box_head
         self.aux_losses = {name: aux for name, aux in (aux_losses or {}).items() if aux is not None}
         self.loss_schedule = tuple(loss_schedule or ())
@@ -151,13 +148,8 @@ class ImageSpace(PoseEstimator):
         if self.detach_position:
             state = state.detach()
         patch = self.image_patches(encoding, state)
-        extra = torch.cat(
-            [
-                self.encoder.sample_features(encoding.context, state),
-                self.position_features(encoding, state),
-            ],
-            dim=-1,
-        )
+        features = self.encoder.sample_features(encoding.context, state)
+        extra = torch.cat([features, self.position_features(encoding, state)], dim=-1)
         predicted = self.net(patch, extra, latent)
         height, width = encoding.image.shape[-2:]
         displacement = self.displacement(
@@ -194,18 +186,13 @@ class ImageSpace(PoseEstimator):
         """Crop the patch at each particle.  (B, N, 2) [px] -> (B, N, 4, k, k), channels as
         `image`.
         """
-        patches: Tensor = self.glimpse(encoding.image, state)
-        return patches
+        return self.glimpse(encoding.image, state)
 
     def position_features(self, encoding: ImageEncoding, state: Tensor) -> Tensor:
         """Return a particle's own position as network input.
 
-        Args:
-            encoding: Encoded images.
-            state: (B, N, 2) particles [px].
-
-        Returns:
-            (B, N, 2) in [-1, 1] within the frame, or (B, N, 0) where the network does not take it.
+        (B, N, 2) [px] -> (B, N, 2) in [-1, 1] within the frame, or (B, N, 0) where the network does
+        not take it.
         """
         if not self.position_width:
             # without gradient: the graph behind the positions would be traversed for nothing
@@ -269,32 +256,17 @@ class ImageSpace(PoseEstimator):
 
 
 def check_latent_width(width: int, required: int | None) -> None:
-    """Check that the latent has the width that a component requires.
-
-    Args:
-        width: Width of the latent.
-        required: Width that the component requires; None: any.
-
-    Raises:
-        UserError: They differ.
-    """
+    """Raise UserError where the latent has not the width that a component requires; None: any."""
     if required not in (None, width):
         raise UserError(
             f"model.net.latent_width={width}: model/box_head=votes needs {required}, one for each "
-            "of "
-            "the box's sides"
+            "of the box's sides"
         )
 
 
 def check_particle_counts(rolled: ParticleFilter, name: str) -> None:
-    """Check that all steps of a training roll-out have the same number of particles.
-
-    Args:
-        rolled: The filter that is rolled out.
-        name: Its key in the settings.
-
-    Raises:
-        UserError: They differ; losses stack the steps into one tensor.
+    """Raise UserError unless all steps of a training roll-out have the same number of particles,
+    since losses stack the steps into one tensor; `name` is the filter's key in the settings.
     """
     if rolled.steps > 1 and rolled.initial_particles != rolled.particles:
         raise UserError(
@@ -305,14 +277,8 @@ def check_particle_counts(rolled: ParticleFilter, name: str) -> None:
 
 
 def objectness_loss(context: ContextMap, mask: Tensor) -> Tensor:
-    """Return the balanced binary cross-entropy of the objectness map.
-
-    Args:
-        context: Feature maps with an objectness map.
-        mask: (B, 1, H, W) bool, the object.
-
-    Returns:
-        (B,), half of the weight on the cells that show the object.
+    """Return the balanced binary cross-entropy of the objectness map, half of the weight on the
+    cells that show the object.  Mask (B, 1, H, W) bool -> (B,).
     """
     logit = context.objectness
     assert logit is not None

@@ -60,13 +60,7 @@ class Keypoints(Hypotheses):
         **base: Arguments of `PoseEstimator`.
     """
 
-    provides: ClassVar[Capabilities] = (
-        "heatmaps",
-        "depth",
-        "pose",
-        "pose_space",
-        "propose_poses",
-    )
+    provides: ClassVar[Capabilities] = ("heatmaps", "depth", "pose", "pose_space", "propose_poses")
     test_only_settings = ("filter", "train_filter", "peaks", "subset", "inlier_px")
 
     def __init__(

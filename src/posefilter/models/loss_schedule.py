@@ -23,14 +23,8 @@ class Stage(NamedTuple):
 
 
 def check_loss_schedule(loss_schedule: Sequence[Stage], names: Sequence[str]) -> None:
-    """Check a schedule.
-
-    Args:
-        loss_schedule: Its stages.
-        names: Names of the losses that there are.
-
-    Raises:
-        UserError: The ends of the stages do not rise to 1, or a loss does not exist.
+    """Raise UserError where the ends of the stages do not rise to 1, or name a loss that is not
+    among `names`.
     """
     ends = [stage.until for stage in loss_schedule]
     if loss_schedule and (sorted(set(ends)) != ends or ends[-1] != 1):

@@ -83,12 +83,10 @@ class Muon(Optimizer):
             alike.setdefault(ahead.shape, []).append((p, ahead))
         for shape, pairs in alike.items():
             size = group["lr"] * 0.2 * max(shape) ** 0.5
-            for (p, _), update in zip(
-                pairs, orthogonalize(torch.stack([u for _, u in pairs])), strict=True
-            ):
-                p.mul_(1 - group["lr"] * group["weight_decay"]).sub_(
-                    update.reshape(p.shape), alpha=size
-                )
+            updates = orthogonalize(torch.stack([ahead for _, ahead in pairs]))
+            for (p, _), update in zip(pairs, updates, strict=True):
+                p.mul_(1 - group["lr"] * group["weight_decay"])
+                p.sub_(update.reshape(p.shape), alpha=size)
 
     def _adam_step(self, parameters: list[Tensor], group: dict[str, Any]) -> None:
         first, second = group["betas"]

@@ -39,11 +39,6 @@ class PoseParticles(PoseEstimator):
             self._space = PoseSpace(tuple(own.center.tolist()), own.radius, points=own.points)
         return self._space
 
-    @property
-    def latent_width(self) -> int:
-        """0: particles have no latent."""
-        return 0
-
     def set_object(self, object_model: ObjectModel) -> None:
         """Set the object, also that of the proposal network, and forget the space about another's
         center.

@@ -158,14 +158,11 @@ class PosePF(PoseParticles):
         assert encoding.cells is not None
         if not self.training:
             require_depth(encoding.cells.valid)
-        return draw_poses(
+        coordinates, size = (
             encoding.coordinates.detach(),
-            encoding.cells,
-            self._center(),
-            self.object_model.radius,
-            particles,
-            generator,
+            (self._center(), self.object_model.radius),
         )
+        return draw_poses(coordinates, encoding.cells, *size, particles, generator)
 
     def training_losses(self, batch: Batch, generator: Generator) -> dict[str, Tensor]:
         """Return the losses of likelihood and proposal network, one value for each image."""
@@ -262,13 +259,6 @@ class PosePF(PoseParticles):
             self.device.type, torch.bfloat16, enabled=fast_bfloat16(self.device)
         )
         with bfloat16 if fast else nullcontext():
-            score: Tensor = self.likelihood(
-                encoding.image,
-                poses,
-                sigma,
-                self._center(),
-                self.object_model.radius,
-                pixels,
-                generator,
-            )
+            size = (self._center(), self.object_model.radius)
+            score: Tensor = self.likelihood(encoding.image, poses, sigma, *size, pixels, generator)
         return score.float() if fast else score

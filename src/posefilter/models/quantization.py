@@ -32,10 +32,8 @@ def pack(state: Mapping[str, Tensor]) -> dict[str, Tensor]:
     out: dict[str, Tensor] = {}
     for name, value in state.items():
         if value.is_floating_point() and value.dim() >= 3 and value.numel() >= _LEAST:
-            scale = (
-                value.abs().amax(dim=tuple(range(1, value.dim())), keepdim=True).clamp_min(1e-12)
-                / 127
-            )
+            largest = value.abs().amax(dim=tuple(range(1, value.dim())), keepdim=True)
+            scale = largest.clamp_min(1e-12) / 127
             out[name] = (value / scale).round().to(torch.int8)
             out[name + _SUFFIX] = scale.float()
         else:

@@ -18,7 +18,6 @@ from lightning.pytorch.utilities.seed import isolate_rng
 from torch import Tensor, nn
 
 from posefilter.errors import UserError
-from posefilter.filters.loop import ParticleFilter
 from posefilter.geometry.pose import is_rigid
 from posefilter.models.base import PoseEstimator
 from posefilter.types import Batch, BeliefBatch, ParticleOutput, Particles, Resampled, Step, Trace
@@ -28,7 +27,6 @@ _RIGID = 1e-2  # of a rotation's entries
 _NORMAL = 1e-3  # of the log of the weights' sum
 # a method that provides one of these names has a function of this name
 _FUNCTIONS = ("image_patches", "propose_poses", "score_poses", "surface_points")
-_FLOAT = (torch.float32,)
 _VERBS = ("schedule", "initialize", "reweight", "resample", "propagate", "estimate", "refine")
 Watch = Callable[..., Any]  # given a part's name, the call, and its arguments
 
@@ -76,10 +74,7 @@ def _look(method: PoseEstimator, seen: Batch) -> None:
 
 def _is_prepared_by_trainer(method: PoseEstimator) -> bool:
     """Tell whether a method has work of its own to do before a training's first step."""
-    return getattr(type(method), "on_fit_start", None) not in (
-        None,
-        LightningModule.on_fit_start,
-    )
+    return getattr(type(method), "on_fit_start", None) not in (None, LightningModule.on_fit_start)
 
 
 def _learn(method: PoseEstimator, learned: Batch) -> None:
@@ -120,10 +115,9 @@ def _check_checkpoint(method: PoseEstimator) -> None:
     for key in ("recipe", "object_model"):
         told = f"the checkpoint lacks '{key}': call super().on_save_checkpoint(checkpoint)"
         _need(key in written, who, told)
-    file = io.BytesIO()
+    del written["state_dict"]
     for key, value in written.items():
-        if key == "state_dict":
-            continue
+        file = io.BytesIO()
         try:
             torch.save(value, file)
             file.seek(0)
@@ -133,13 +127,16 @@ def _check_checkpoint(method: PoseEstimator) -> None:
                 f"{who}: checkpoint['{key}'] holds other than tensors, numbers, texts, lists and "
                 f"dicts, which no command reads again"
             ) from error
-        file.seek(0)
-        file.truncate()
 
 
 def _need(good: bool, who: str, told: str) -> None:
     if not good:
         raise UserError(f"{who}: {told}")
+
+
+def _need_type(who: str, value: Any, kind: type) -> None:
+    told = f"returned a {type(value).__name__}, not a posefilter.types.{kind.__name__}"
+    _need(isinstance(value, kind), who, told)
 
 
 def _check_tensor(
@@ -161,15 +158,15 @@ def _check_tensor(
         infinite: Whether it may be minus infinity.
     """
     wanted = f"({', '.join('*' if n is None else str(n) for n in shape)}{',' * (len(shape) == 1)})"
-    if not isinstance(value, Tensor):
-        raise UserError(f"{who}: {what} is a {type(value).__name__}, not a tensor {wanted}")
+    told = f"{what} is a {type(value).__name__}, not a tensor {wanted}"
+    _need(isinstance(value, Tensor), who, told)
     fits = len(shape) == value.dim() and all(
         n in (None, m) for n, m in zip(shape, value.shape, strict=True)
     )
     _need(fits, who, f"{what} has the shape {tuple(value.shape)}, not {wanted}")
     dtype = str(value.dtype).removeprefix("torch.")
     wants = "float32" if value.dtype.is_floating_point or not other_types else "floats"
-    _need(value.dtype in (*_FLOAT, *other_types), who, f"{what} is {dtype}, not {wants}")
+    _need(value.dtype in (torch.float32, *other_types), who, f"{what} is {dtype}, not {wants}")
     good = value.isfinite() | (value == -torch.inf) if infinite else value.isfinite()
     _need(bool(good.all()), who, f"{what} is not finite")
 
@@ -189,7 +186,8 @@ class _Watcher:
         """Watch the method, its filters, its likelihood and its loss."""
         method = self.method
         for one in (method.filter, method.train_filter):
-            self._watch_filter(one)
+            for name in _VERBS:
+                self._extend(getattr(one, name), __call__=getattr(self, f"_{name}"))
         self._extend(method.loss, __call__=self._loss)
         if isinstance(likelihood := getattr(method, "likelihood", None), nn.Module):
             self._extend(likelihood, __call__=self._likelihood)
@@ -197,10 +195,6 @@ class _Watcher:
         if hasattr(method, "score_poses"):
             watches["score_poses"] = self._score_poses
         self._extend(method, **watches)
-
-    def _watch_filter(self, one: ParticleFilter) -> None:
-        for name in _VERBS:
-            self._extend(getattr(one, name), __call__=getattr(self, f"_{name}"))
 
     def _extend(self, part: Any, **watches: Watch) -> None:
         if id(part) in self._known:
@@ -241,8 +235,7 @@ class _Watcher:
 
     def _resample(self, who: str, call: Watch, particles: Particles, count: int, *_: Any) -> Any:
         out = call()
-        told = f"returned a {type(out).__name__}, not a posefilter.types.Resampled"
-        _need(isinstance(out, Resampled), who, told)
+        _need_type(who, out, Resampled)
         B, N = particles.log_weights.shape
         _check_tensor(who, "log_weights", out.log_weights, (B, count), infinite=True)
         total = out.log_weights.logsumexp(1)
@@ -274,8 +267,7 @@ class _Watcher:
         return self._check_belief(who, call(), len(belief.best))
 
     def _check_belief(self, who: str, out: Any, images: int) -> Any:
-        told = f"returned a {type(out).__name__}, not a posefilter.types.BeliefBatch"
-        _need(isinstance(out, BeliefBatch), who, told)
+        _need_type(who, out, BeliefBatch)
         _check_tensor(who, "log_weights", out.log_weights, (images, None), infinite=True)
         count = out.log_weights.shape[1]
         _check_tensor(who, "poses", out.poses, (images, count, 4, 4))
@@ -292,8 +284,7 @@ class _Watcher:
         self, who: str, call: Watch, encoding: Any, particles: Particles, step: Step, *_: Any
     ) -> Any:
         out = call()
-        told = f"returned a {type(out).__name__}, not a posefilter.types.ParticleOutput"
-        _need(isinstance(out, ParticleOutput), who, told)
+        _need_type(who, out, ParticleOutput)
         B, N = particles.log_weights.shape
         _check_tensor(who, "log_likelihood", out.log_likelihood, (B, N), infinite=True)
         told = "log_likelihood is -inf for all particles of an image"

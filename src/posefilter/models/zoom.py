@@ -9,7 +9,7 @@ camera: its poses are those of the whole image.
 
 from copy import copy
 from itertools import islice
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch
@@ -31,13 +31,6 @@ PART_ZOOM = 2.0  # of the parts in which a doubtful object is looked for
 STEPS = 3  # of the filter, after which particles that agree are near the object
 HEAVIEST = 200  # particles that a place may be about
 AGREED = 0.7  # weight of the particles within half a diameter of one of them
-
-
-class Place(NamedTuple):
-    """Where most of the weight of B images' particles is."""
-
-    center: Tensor  # (B, 3) of the object, in camera axes [m]
-    weight: Tensor  # (B,) that is there, in [0, 1]
 
 
 def with_encoding(method: Any, encoding: Encoding) -> Any:
@@ -78,9 +71,9 @@ def search(
     run = method.filter if particle_filter is None else particle_filter
     target: float | None = getattr(run, "zoom_diameter", None)
     if target is None:
-        encoded = method if encoding is None else with_encoding(method, encoding)
-        trace: Trace = run(batch, encoded, generator)
-        return trace
+        return run(
+            batch, method if encoding is None else with_encoding(method, encoding), generator
+        )
     encoding = method.encode(batch) if encoding is None else encoding
     object_model = method.object_model
     steps = run.iterate(batch, encoding, method, generator)
@@ -100,7 +93,8 @@ def search(
         late = ~small & (zoom > 1)
         if not (small | late).any():
             return whole._replace(encoding=encoding)
-        whole, small = take(whole, ~late[~small]), small | late
+        others = ~late[~small]
+        whole, small = map_traces(lambda x: x[others], whole), small | late
     pixels = project(centers[:, None], batch.intrinsics)[:, 0]
     view = magnify(select(batch, small), pixels[small], zoom[small])
     near: Trace = run(view, method, generator)
@@ -131,8 +125,10 @@ def choose_part(method: Any, image: Batch) -> Batch | None:
     return Batch(*(x[surest : surest + 1] for x in parts))
 
 
-def find_place(particles: Particles, object_model: ObjectModel) -> Place:
-    """Return the place with the most weight within half a diameter of it."""
+def find_place(particles: Particles, object_model: ObjectModel) -> tuple[Tensor, Tensor]:
+    """Return the place with the most weight within half a diameter of it, (B, 3) of the object's
+    center in camera axes [m], and that weight, (B,) in [0, 1].
+    """
     centers = origin_of(particles.state, object_model.center.to(particles.state.device))
     weights = particles.log_weights.exp()
     heaviest = weights.topk(min(HEAVIEST, weights.shape[1])).indices
@@ -141,7 +137,7 @@ def find_place(particles: Particles, object_model: ObjectModel) -> Place:
     most, index = (near * weights[:, None]).sum(-1).max(1)
     own = near[torch.arange(len(index), device=index.device), index] * weights
     mean = (own[..., None] * centers).sum(1) / own.sum(1, keepdim=True)
-    return Place(mean, most)
+    return mean, most
 
 
 def measure_zoom(
@@ -189,13 +185,15 @@ def magnify(batch: Batch, pixels: Tensor, zoom: Tensor) -> Batch:
     height, width = batch.rgb.shape[-2:]
     color, depth, mask, cameras = [], [], [], []
     for i in range(len(pixels)):
-        part = _place_window(batch, pixels[i], zoom[i])
-        _, rows, columns = part
-        seen = F.interpolate(
-            batch.rgb[i][part][None], (height, width), mode="bilinear", align_corners=False
+        (u, v), factor = pixels[i].tolist(), float(zoom[i])
+        rows, columns = _place(v, height, factor), _place(u, width, factor)
+        part = slice(None), rows, columns
+        color.append(
+            F.interpolate(
+                batch.rgb[i][part][None], (height, width), mode="bilinear", align_corners=False
+            )
         )
         z = resize_depth(batch.depth[i][part][0].cpu().numpy(), height, width)
-        color.append(seen)
         depth.append(torch.from_numpy(np.ascontiguousarray(z)).to(batch.depth))
         mask.append(F.interpolate(batch.mask[i][part][None].float(), (height, width)) > 0.5)
         K = batch.intrinsics[i].clone()
@@ -210,13 +208,6 @@ def magnify(batch: Batch, pixels: Tensor, zoom: Tensor) -> Batch:
     )
 
 
-def _place_window(batch: Batch, pixel: Tensor, zoom: Tensor) -> tuple[slice, slice, slice]:
-    """Return the channels, rows and columns of a window; pixel (2,) [px], zoom ()."""
-    height, width = batch.rgb.shape[-2:]
-    (u, v), factor = pixel.tolist(), float(zoom)
-    return slice(None), _place(v, height, factor), _place(u, width, factor)
-
-
 def _place(center: float, size: int, zoom: float) -> slice:
     """Return the pixels of a window along one side of the image."""
     count = min(size, max(1, round(size / zoom)))
@@ -227,11 +218,6 @@ def _place(center: float, size: int, zoom: float) -> slice:
 def select(batch: Batch, rows: Tensor) -> Batch:
     """Return some images of a batch; rows (B,) bool."""
     return Batch(*(x[rows] for x in batch))
-
-
-def take(trace: Trace, rows: Tensor) -> Trace:
-    """Return the trace of some images; rows (B,) bool."""
-    return map_traces(lambda x: x[rows], trace)
 
 
 def merge(first: Trace | None, second: Trace, is_second: Tensor) -> Trace:
