@@ -285,11 +285,7 @@ class Result:
         return draw_belief(rgb, intrinsics, tensors, self.object_model)
 
     def draw_band(
-        self,
-        rgb: Any,
-        intrinsics: Any,
-        shape: "Shape | None" = None,
-        level: float = 0.95,
+        self, rgb: Any, intrinsics: Any, shape: "Shape | None" = None, level: float = 0.95
     ) -> np.ndarray:
         """Draw how sure the belief is of the object's outline: the band in which, at a point of
         the outline, it lies with the probability `level`, if the belief is right.

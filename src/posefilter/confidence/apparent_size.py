@@ -90,9 +90,8 @@ def _measure(pose: Tensor, seen: _Seen, object_model: ObjectModel) -> tuple[Tens
     scales = exponents.exp().to(pose)  # 1 is the middle one
     turned = scales[:, None, None, None] * (points @ rotation_of(pose).mT)  # (S, cells, K, 3)
     away = measured[:, None] / object_model.radius - turned  # where each fragment puts the center
-    center = (origin_of(pose, object_model.center.to(pose)) / object_model.radius).expand(
-        len(scales), 3
-    )
+    center = origin_of(pose, object_model.center.to(pose)) / object_model.radius
+    center = center.expand(len(scales), 3)
     for _ in range(_ROUNDS):
         each = share - (away - center[:, None, None]).square().sum(-1) / (2 * _NOISE**2)
         whole = each.logsumexp(-1)

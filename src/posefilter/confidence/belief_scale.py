@@ -186,12 +186,7 @@ def calibrate_belief(
 
 
 def _redraw(
-    belief: BeliefBatch,
-    i: int,
-    factor: float,
-    count: int,
-    object_model: ObjectModel,
-    degrees: int,
+    belief: BeliefBatch, i: int, factor: float, count: int, object_model: ObjectModel, degrees: int
 ) -> tuple[Tensor, Tensor, int]:
     """Return the poses (count, 4, 4) and log weights (count,) of one calibrated belief, float64,
     and how many of the first are draws.

@@ -26,9 +26,9 @@ def find_blank(rgb: np.ndarray, depth: np.ndarray) -> str:
     height, width = rgb.shape[:2]
     size = (max(1, width // _SIDE), max(1, height // _SIDE))
     coarse = cv2.resize(rgb, size, interpolation=cv2.INTER_AREA).reshape(-1, 3)
-    contrast = float(np.ptp(coarse, axis=0).max()) / (255 if rgb.dtype == np.uint8 else 1)
-    if contrast < _CONTRAST:
-        brightness = float(coarse.mean()) / (255 if rgb.dtype == np.uint8 else 1)
+    white = 255 if rgb.dtype == np.uint8 else 1
+    if float(np.ptp(coarse, axis=0).max()) / white < _CONTRAST:
+        brightness = float(coarse.mean()) / white
         dark = "black (a covered lens, or colors divided by 255 twice?)"
         color = dark if brightness < _CONTRAST else "of one color (is it the right file?)"
         return f"the color image is {color}, so that nothing can be judged by it"

@@ -126,9 +126,8 @@ class Calibration:
         A feature that is not a number speaks against the estimate as far as any can.
         """
         x = self._standardize(x)
-        parts = (self.presence, self.fit_success(tolerance))
-        presence, success = (_evaluate(one, x) for one in parts)
-        return Assessment(presence, presence * success)
+        presence = _evaluate(self.presence, x)
+        return Assessment(presence, presence * _evaluate(self.fit_success(tolerance), x))
 
     def fit_success(self, tolerance: PoseTolerance = RIGHT) -> Logistic:
         """Return the regression of whether the pose of an object that is there keeps a tolerance.

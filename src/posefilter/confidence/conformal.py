@@ -88,10 +88,7 @@ def choose_edges(probability: np.ndarray) -> tuple[float, ...]:
 
 
 def fit_conformal(
-    scores: np.ndarray,
-    values: np.ndarray,
-    edges: Sequence[float] = EDGES,
-    by: By = "surface",
+    scores: np.ndarray, values: np.ndarray, edges: Sequence[float] = EDGES, by: By = "surface"
 ) -> Conformal:
     """Sort the nonconformity scores of calibration frames into groups.
 

@@ -81,16 +81,10 @@ class _Image(NamedTuple):
 
 
 def measure_print(best: Tensor, batch: Batch, object_model: ObjectModel) -> dict[str, Tensor]:
-    """Return whether the image shows the object's print where poses put it.
+    """Return whether the image shows the object's print where poses (B, 4, 4) put it [m].
 
-    Args:
-        best: (B, 4, 4) camera_from_object [m].
-        batch: B images.
-        object_model: The object.
-
-    Returns:
-        (B,) `texture`: the logarithm of one plus the evidence of the print [nat]. Nothing where the
-        object has no texture.
+    (B,) `texture`: the logarithm of one plus the evidence of the print [nat]. Nothing where the
+    object has no texture.
     """
     if object_model.texture is None:
         return {}

@@ -8,14 +8,9 @@ import numpy as np
 import torch
 
 from posefilter.confidence.belief_scale import BeliefScale
-from posefilter.confidence.calibration import (
-    Assessment,
-    Calibration,
-    standardize,
-    tabulate_errors,
-)
+from posefilter.confidence.calibration import Assessment, Calibration, standardize, tabulate_errors
 from posefilter.confidence.conformal import choose_edges, fit_conformal
-from posefilter.confidence.logistic import Logistic, fit_logistic
+from posefilter.confidence.logistic import fit_logistic
 from posefilter.confidence.tolerance import RIGHT, PoseErrors
 from posefilter.errors import UserError
 
@@ -74,9 +69,13 @@ def fit_choice(frames: Frames, source: str) -> Calibration:
     """
     _check_counts(frames)
     fitted = _fit(frames, source, {})
-    share = float(np.clip(frames.correct.mean(), 0.05, 0.95))
-    balance = np.where(frames.correct, 0.5 / share, 0.5 / (1 - share))
+    balance = _balance(frames.correct, float(np.clip(frames.correct.mean(), 0.05, 0.95)))
     return replace(fitted, choice=fit_logistic(standardize_frames(frames), frames.correct, balance))
+
+
+def _balance(label: np.ndarray, share: float) -> np.ndarray:
+    """Return how much each frame counts, so that a share of them counts as half of them."""
+    return np.where(label, 0.5 / share, 0.5 / (1 - share))
 
 
 def fit_calibration(
@@ -113,10 +112,8 @@ def fit_calibration(
 
 
 def _check_counts(frames: Frames) -> None:
-    for count, which in (
-        (int(frames.present.sum()), "with"),
-        (int((~frames.present).sum()), "without"),
-    ):
+    for own, which in ((frames.present, "with"), (~frames.present, "without")):
+        count = int(own.sum())
         if count < FEWEST:
             raise UserError(
                 f"calibrate: {count} frames {which} the object; {FEWEST} are needed at least"
@@ -124,10 +121,7 @@ def _check_counts(frames: Frames) -> None:
 
 
 def _fit(
-    frames: Frames,
-    source: str,
-    quality: Mapping[str, float],
-    first: Calibration | None = None,
+    frames: Frames, source: str, quality: Mapping[str, float], first: Calibration | None = None
 ) -> Calibration:
     there, right = frames.present, frames.correct
     counts = {
@@ -135,21 +129,21 @@ def _fit(
         "wrong": int((there & ~right).sum()),
         "absent": int((~there).sum()),
     }
-    none = Logistic((0.0,) * len(frames.features), 0.0)
     center, scale = _find_standard(frames, first)
-    out = Calibration(frames.features, center, scale, none, none, counts, source, dict(quality))
-    if first is not None:
-        out = replace(out, choice=first.choice)
     x = standardize(frames.values, center, scale)
-    share = there.mean()
-    balance = np.where(there, 0.5 / share, 0.5 / (1 - share))
     errors = None
     if frames.errors is not None:
         errors = tabulate_errors(x[there], np.stack(frames.errors, axis=1)[there])
-    return replace(
-        out,
-        presence=fit_logistic(x, there, balance),
+    return Calibration(
+        frames.features,
+        center,
+        scale,
+        presence=fit_logistic(x, there, _balance(there, there.mean())),
         success=fit_logistic(x[there], right[there]),
+        counts=counts,
+        source=source,
+        quality=dict(quality),
+        choice=None if first is None else first.choice,
         errors=errors,
     )
 

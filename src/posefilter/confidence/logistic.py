@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-PENALTY = 1.0  # of the squared weights: the inverse variance of their prior
+_PENALTY = 1.0  # of the squared weights: the inverse variance of their prior
 
 
 @dataclass(frozen=True)
@@ -24,16 +24,13 @@ class Logistic:
     bias: float
 
 
-def fit_logistic(
-    x: np.ndarray, label: np.ndarray, balance: np.ndarray | None = None, penalty: float = PENALTY
-) -> Logistic:
+def fit_logistic(x: np.ndarray, label: np.ndarray, balance: np.ndarray | None = None) -> Logistic:
     """Return the logistic regression of highest posterior density, with weights of 0 or more.
 
     Args:
         x: (n, F) standardized features.
         label: (n,) bool.
         balance: (n,) how much each frame counts; None: 1.
-        penalty: Inverse variance of the weights' normal prior.
     """
     from scipy.optimize import minimize  # slow to import, and most predictions fit nothing
 
@@ -46,8 +43,8 @@ def fit_logistic(
         z = x @ weights + bias
         value = (count * (np.logaddexp(0, z) - target * z)).sum()
         slope = count * (1 / (1 + np.exp(-z)) - target)
-        gradient = np.append(x.T @ slope + penalty * weights, slope.sum())
-        return value + 0.5 * penalty * weights @ weights, gradient
+        gradient = np.append(x.T @ slope + _PENALTY * weights, slope.sum())
+        return value + 0.5 * _PENALTY * weights @ weights, gradient
 
     start = np.zeros(x.shape[1] + 1)
     bounds = [(0, None)] * x.shape[1] + [(None, None)]

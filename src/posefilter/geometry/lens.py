@@ -59,10 +59,7 @@ def undistort(
     # masked depth is unknown
     color, z = (np.ascontiguousarray(np.ma.filled(one, 0)) for one in (rgb, depth))
     try:
-        return (
-            cv2.remap(color, *maps, cv2.INTER_LINEAR),
-            cv2.remap(z, *maps, cv2.INTER_NEAREST),
-        )
+        return cv2.remap(color, *maps, cv2.INTER_LINEAR), cv2.remap(z, *maps, cv2.INTER_NEAREST)
     except cv2.error as error:
         raise UserError(
             f"rgb, depth: types {color.dtype} and {z.dtype} of {width}x{height} pixels cannot be "

@@ -63,9 +63,8 @@ def sample(image: Tensor, pixels: Tensor, stride: int = 1, padding: str = "zeros
     cells = (pixels - (stride - 1) / 2) / stride
     scale = pixels.new_tensor([max(w - 1, 1), max(h - 1, 1)])
     grid = (cells / scale * 2 - 1)[:, :, None]
-    return F.grid_sample(image, grid, padding_mode=padding, align_corners=True)[..., 0].transpose(
-        1, 2
-    )
+    values = F.grid_sample(image, grid, padding_mode=padding, align_corners=True)
+    return values[..., 0].transpose(1, 2)
 
 
 def overlaps_mask(mask: Tensor, pixels: Tensor, size: int = 1) -> Tensor:
@@ -116,9 +115,8 @@ def mask_pixels(mask: Tensor, max_pixels: int | None = None) -> tuple[Tensor, Te
     for one in mask[:, 0]:
         pixels = one.nonzero().flip(-1).float()
         if max_pixels is not None and len(pixels) > max_pixels:
-            pixels = pixels[
-                torch.linspace(0, len(pixels) - 1, max_pixels, device=pixels.device).long()
-            ]
+            every = torch.linspace(0, len(pixels) - 1, max_pixels, device=pixels.device)
+            pixels = pixels[every.long()]
         found.append(pixels)
     longest = max(1, *(len(f) for f in found))
     positions = torch.stack([F.pad(f, (0, 0, 0, longest - len(f))) for f in found])
@@ -159,11 +157,8 @@ def nearest_mask_pixel(mask: Tensor, pixels: Tensor, chunk: int | None = None) -
         chunk = 1 << (17 if pixels.device.type == "cpu" else 25)
     parts = pixels.split(max(1, chunk // rim.shape[:2].numel()), dim=1)
     # |x - r|^2 less |x|^2, which is the same for every r
-    best = torch.cat(
-        [argmin(torch.baddbmm(square, part, rim.transpose(1, 2), alpha=-2)) for part in parts],
-        dim=1,
-    )
-    found = rim.gather(1, best[..., None].expand(-1, -1, 2))
+    best = [argmin(torch.baddbmm(square, part, rim.mT, alpha=-2)) for part in parts]
+    found = rim.gather(1, torch.cat(best, dim=1)[..., None].expand(-1, -1, 2))
     own = nearest_pixel(pixels)
     found = torch.where(gather_pixels(mask.float(), own) > 0, own.to(found.dtype), found)
     return torch.where(mask.flatten(1).any(1)[:, None, None], found, pixels)
@@ -180,6 +175,5 @@ def centroid(mask: Tensor) -> Tensor:
     u = (weight.sum(1) * torch.arange(W, device=mask.device)).sum(1)
     v = (weight.sum(2) * torch.arange(H, device=mask.device)).sum(1)
     frame = torch.tensor([(W - 1) / 2, (H - 1) / 2], device=mask.device)
-    return torch.where(
-        total[:, None] > 0, torch.stack([u, v], -1) / total[:, None].clamp_min(1), frame
-    )
+    mean = torch.stack([u, v], -1) / total[:, None].clamp_min(1)
+    return torch.where(total[:, None] > 0, mean, frame)

@@ -24,11 +24,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from posefilter.geometry.pose_kernels import (
-    measure_modes,
-    measure_neighbors,
-    whiten_kernels,
-)
+from posefilter.geometry.pose_kernels import measure_modes, measure_neighbors, whiten_kernels
 from posefilter.geometry.pose_twists import TwistParts, pair_twists, split_poses
 from posefilter.geometry.symmetries import gather_copies
 
@@ -116,9 +112,8 @@ def fit_density(
             scale = log_scale - 6 * math.log(factor)
             log_kernel = scale[:, None] - 0.5 / factor**2 * square - log_volume
             # the copies that symmetries make are far, or nearly alike: left out of the choice
-            score = float(
-                (share * _mix(kernels, log_kernel, parts.center[judged, None], judged)).sum()
-            )
+            log_p = _mix(kernels, log_kernel, parts.center[judged, None], judged)
+            score = float((share * log_p).sum())
             if score > highest:
                 best = kernels._replace(whiten=whiten / factor, log_scale=scale)
                 highest = score
@@ -217,9 +212,8 @@ def _thin(log_weights: Tensor, max_kernels: int) -> tuple[Tensor, Tensor]:
         return torch.arange(count, device=log_weights.device), log_weights
     order = log_weights.argsort(descending=True, stable=True)
     heavy, rest = order[: max_kernels // 2], order[max_kernels // 2 :]
-    few = rest[
-        torch.linspace(0, len(rest) - 1, max_kernels // 2, device=rest.device).round().long()
-    ]
+    every = torch.linspace(0, len(rest) - 1, max_kernels // 2, device=rest.device).round().long()
+    few = rest[every]
     stands_for = (log_weights[rest].logsumexp(0) - log_weights[few].logsumexp(0)).nan_to_num(0.0)
     shares = torch.cat([log_weights[heavy], log_weights[few] + stands_for])
     return torch.cat([heavy, few]), shares.log_softmax(0)

@@ -3,7 +3,7 @@
 import copy
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
@@ -57,15 +57,12 @@ class _Job:
     generator: Generator
     searches: int = 0
     exhausted: bool = False
-    seconds: float = field(default=0.0)
+    seconds: float = 0.0
 
 
 @torch.no_grad()
 def detect(
-    methods: Sequence[PoseEstimator],
-    batches: Sequence[Batch],
-    counts: Sequence[int],
-    costs: Costs,
+    methods: Sequence[PoseEstimator], batches: Sequence[Batch], counts: Sequence[int], costs: Costs
 ) -> tuple[list[Detection], list[float]]:
     """Find the instances of several classes in one image, no two on the same pixels.
 

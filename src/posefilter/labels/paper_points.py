@@ -35,6 +35,5 @@ class PaperPoints:
         offset = trace.particles[-1].state[..., 2]
         own_color = trace.particles[-1].state[..., 3] > 0.5
         label = torch.where(offset > self.tolerance, self.behind_label, 0.0)
-        return torch.where((offset.abs() <= self.tolerance) & own_color, self.surface_label, label)[
-            None
-        ]
+        on_surface = (offset.abs() <= self.tolerance) & own_color
+        return torch.where(on_surface, self.surface_label, label)[None]

@@ -105,19 +105,15 @@ class PoseDensity:
         double = torch.tensor(2 * self.sharpness, dtype=torch.float64)
         # I_0 and I_1 without e^(2 k)
         bessel = float(torch.special.i0e(double) - torch.special.i1e(double))
-        self.log_scale = (
-            -math.log(bessel)
-            - 2 * math.log(math.pi)
-            - 1.5 * math.log(2 * math.pi * self.translation_m**2)
-        )
+        log_volume = math.log(bessel) + 2 * math.log(math.pi)
+        self.log_scale = -log_volume - 1.5 * math.log(2 * math.pi * self.translation_m**2)
 
     def __call__(
         self, particles: Particles, output: ParticleOutput, batch: Batch, object_model: ObjectModel
     ) -> Tensor:
         """Return (B,) [nat]."""
-        truth = batch.camera_from_object[:, None] @ object_model.symmetries.to(
-            batch.camera_from_object
-        )
+        truth = batch.camera_from_object[:, None]
+        truth = truth @ object_model.symmetries.to(truth)
         log_kernel = self.log_kernel(output.pose[:, None], truth[:, :, None], object_model.center)
         log_p = (particles.log_weights[:, None] + log_kernel).logsumexp((1, 2))
         return log_p - math.log(truth.shape[1])

@@ -28,10 +28,8 @@ def pose_distance(
         Distances (B, N) [m].
     """
     few = subsample(object_model.points, points).to(poses.device)
-    options = [
-        add_distance(poses, truth @ symmetry, few)
-        for symmetry in object_model.symmetries.to(poses.device)
-    ]
+    group = object_model.symmetries.to(poses.device)
+    options = [add_distance(poses, truth @ symmetry, few) for symmetry in group]
     return torch.stack(options).amin(0)
 
 

@@ -36,12 +36,8 @@ class Offset:
         """Return (B,)."""
         positions = displaced_positions(trace)
         flat = positions.transpose(0, 1).flatten(1, 2)
-        return (
-            ((flat - nearest_mask_pixel(batch.mask, flat)) / batch.rgb.shape[-1])
-            .square()
-            .sum(-1)
-            .mean(1)
-        )
+        offset = (flat - nearest_mask_pixel(batch.mask, flat)) / batch.rgb.shape[-1]
+        return offset.square().sum(-1).mean(1)
 
 
 class Chamfer:
@@ -65,9 +61,9 @@ class Chamfer:
     def __call__(self, trace: Trace, batch: Batch, object_model: ObjectModel) -> Tensor:
         """Return (B,)."""
         positions = displaced_positions(trace).transpose(0, 1).flatten(1, 2)
-        return (
-            self.patch_to_mask(positions, batch.mask) + self.mask_to_patch(positions, batch.mask)
-        ) / batch.rgb.shape[-1] ** 2
+        there = self.patch_to_mask(positions, batch.mask)
+        back = self.mask_to_patch(positions, batch.mask)
+        return (there + back) / batch.rgb.shape[-1] ** 2
 
     def patch_to_mask(self, positions: Tensor, mask: Tensor) -> Tensor:
         """Return the mean squared distance of each patch pixel to its nearest mask pixel.

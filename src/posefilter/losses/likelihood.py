@@ -105,6 +105,5 @@ class Focal(Bce):
         """Return (B,)."""
         log_p, y, entropy = self._compare(trace, batch, object_model)
         side = torch.where(y > 0, self.alpha, 1 - self.alpha)
-        return (side * ((y - log_p.exp()).square() + 1e-12) ** (self.gamma / 2) * entropy).mean(
-            (0, 2)
-        )
+        focus = ((y - log_p.exp()).square() + 1e-12) ** (self.gamma / 2)
+        return (side * focus * entropy).mean((0, 2))

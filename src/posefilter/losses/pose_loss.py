@@ -80,9 +80,8 @@ class Confidence:
         on = self.label(trace, batch, object_model) > 0
         total = batch.rgb.new_zeros(len(batch.rgb))
         for output, inside in zip(trace.outputs, on, strict=True):
-            error = (
-                add_distance(output.pose, batch.camera_from_object, points) / object_model.diameter
-            )
+            error = add_distance(output.pose, batch.camera_from_object, points)
+            error = error / object_model.diameter
             log_c = output.log_likelihood
             fit = error * log_c.exp() - self.weight * log_c
             fit = (fit * inside).sum(1) / inside.sum(1).clamp_min(1)

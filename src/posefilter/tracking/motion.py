@@ -120,12 +120,10 @@ class ConstantVelocity:
         Returns:
             Moved poses (B, N, 4, 4).
         """
-        noise = torch.randn(
-            *state.shape[:2], 6, generator=generator, device=state.device, dtype=state.dtype
-        )
-        return space.move(
-            state, drift[:, None] + noise_scale * noise * state.new_tensor(self.scale)
-        )
+        shape = (*state.shape[:2], 6)
+        noise = torch.randn(shape, generator=generator, device=state.device, dtype=state.dtype)
+        move = drift[:, None] + noise_scale * noise * state.new_tensor(self.scale)
+        return space.move(state, move)
 
 
 def _three(value: float | Sequence[float], name: str) -> tuple[float, ...]:

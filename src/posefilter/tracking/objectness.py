@@ -12,9 +12,8 @@ from posefilter.models.base import PoseEstimator
 from posefilter.types import Batch, Trace
 
 _POINTS = 256  # of the surface, that are looked at
-_FULL = (
-    0.6  # objectness that is as good as 1: rims and what stands before an object take their share
-)
+# objectness that is as good as 1: rims and what stands before an object take their share
+_FULL = 0.6
 
 
 def measure_objectness(objectness: Tensor, batch: Batch, pose: Tensor, points: Tensor) -> float:

@@ -18,7 +18,7 @@ from typing import Any
 from posefilter.errors import UserError
 from posefilter.tracking.frame import Frame
 from posefilter.tracking.track import Track, TrackResult
-from posefilter.tracking.worker import Answer, Start, Task, restore
+from posefilter.tracking.worker import Start, Task, restore
 
 _MOST_RESTARTS = 10  # of processes that ended
 _PROGRAM = """
@@ -181,7 +181,8 @@ class MultiprocessTracker:
                 if isinstance(answers, Exception):
                     error = answers
                 elif answers:
-                    out |= self._restore(share, answers)
+                    pairs = zip(share, answers, strict=True)
+                    out |= {i: restore(self.tracks[i], answer) for i, answer in pairs}
         finally:  # an answer that was not read would be taken for that of the next frame
             for worker, _ in asked:
                 worker.close()
@@ -205,9 +206,6 @@ class MultiprocessTracker:
 
     def _start(self) -> WorkerProcess:
         return WorkerProcess(self._content, self._threads)
-
-    def _restore(self, share: Sequence[int], answers: list[Answer]) -> dict[int, TrackResult]:
-        return {i: restore(self.tracks[i], x) for i, x in zip(share, answers, strict=True)}
 
     def wait(self) -> None:
         """Wait until all processes have started."""

@@ -39,11 +39,7 @@ class TrackRow(NamedTuple):
 
 
 def make_row(
-    video: str,
-    frame: str,
-    ids: tuple[int, int, int],
-    result: TrackResult,
-    truth: np.ndarray | None,
+    video: str, frame: str, ids: tuple[int, int, int], result: TrackResult, truth: np.ndarray | None
 ) -> TrackRow:
     """Return the row of a frame's result.  ids: of scene, image and object, as BOP has them."""
     errors = (math.nan, math.nan)
@@ -92,11 +88,10 @@ def compute_figures(rows: Sequence[TrackRow], object_model: ObjectModel) -> dict
     for name in ("add", "add_s"):
         errors = [getattr(row, name) if row.result.is_tracked else math.inf for row in known]
         out[name] = summarize(torch.tensor(errors), object_model.diameter)
-    wrong = [
-        row for row in known if row.result.is_tracked and row.add_s >= 0.1 * object_model.diameter
-    ]
-    absent = [row for row in rows if row.truth is None and row.result.is_tracked]
-    out["false_tracks"] = len(wrong) + len(absent)
+    limit = 0.1 * object_model.diameter
+    out["false_tracks"] = sum(
+        row.result.is_tracked and (row.truth is None or row.add_s >= limit) for row in rows
+    )
     jitters = [measure_row_jitter(run, object_model) for run in _follow_ups(rows)]
     shifts, turns = zip(*jitters, strict=True) if jitters else ((), ())
     out["jitter_mm"], out["jitter_deg"] = _rms(shifts), _rms(turns)
@@ -114,12 +109,9 @@ def _follow_ups(rows: Sequence[TrackRow]) -> list[tuple[TrackRow, TrackRow]]:
     """Return the pairs of rows, one after the other in a video, in which the object was tracked and
     its true pose is known.
     """
-    return [
-        (a, b)
-        for a, b in pairwise(rows)
-        if a.video == b.video
-        and all(row.result.is_tracked and row.truth is not None for row in (a, b))
-    ]
+    good = [row.result.is_tracked and row.truth is not None for row in rows]
+    pairs = zip(pairwise(rows), pairwise(good), strict=True)
+    return [(a, b) for (a, b), both in pairs if a.video == b.video and all(both)]
 
 
 def _rms(values: Sequence[float]) -> float:
@@ -129,20 +121,14 @@ def _rms(values: Sequence[float]) -> float:
 def describe_row(row: TrackRow) -> dict[str, Any]:
     """Return a row as plain content, a line of poses.jsonl."""
     result = row.result
+    own = ("video", "frame", "scene_id", "im_id", "obj_id")
+    measured = ("score", "objectness", "presence", "probability", "particles")
     return {
-        "video": row.video,
-        "frame": row.frame,
-        "scene_id": row.scene_id,
-        "im_id": row.im_id,
-        "obj_id": row.obj_id,
+        **{name: getattr(row, name) for name in own},
         "object": result.object,
         "status": result.status,
         "camera_from_object": result.pose.tolist(),
-        "score": result.score,
-        "objectness": result.objectness,
-        "presence": result.presence,
-        "probability": result.probability,
-        "particles": result.particles,
+        **{name: getattr(result, name) for name in measured},
         "standard_deviations": np.sqrt(np.diag(result.covariance)).tolist(),
         "add_mm": 1000 * row.add,
         "add_s_mm": 1000 * row.add_s,

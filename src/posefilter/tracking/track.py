@@ -146,9 +146,8 @@ class Track:
 
     def reset(self) -> None:
         """Forget the object: the next frame is the first."""
-        self.generator = torch.Generator(device=self.method.device).manual_seed(
-            self.seed % (1 << 63)
-        )
+        seed = self.seed % (1 << 63)
+        self.generator = torch.Generator(device=self.method.device).manual_seed(seed)
         self.state: State | None = None
         self.loss_detector = TrackLossDetector(self.settings)
         self.frames = 0
@@ -239,9 +238,8 @@ class Track:
             # by the scale in each of six dimensions
             steps = follow.steps + math.ceil(math.log(scale, 4))
             level = max(follow.initial_sigma, min(_WIDE, scale * follow.initial_sigma))
-            follow = replace(
-                follow, steps=steps, initial_sigma=level, proposals=3 * follow.proposals
-            )
+            proposals = 3 * follow.proposals
+            follow = replace(follow, steps=steps, initial_sigma=level, proposals=proposals)
             against = max(0.0, against - 6 * math.log(scale))
         elif windowed:  # what it shows is the predicted belief's already
             follow = replace(follow, proposals=0)
@@ -406,30 +404,17 @@ class Track:
         state, draws = self.state, None
         if state is None:  # no more than a guess: a meter ahead
             ahead = torch.eye(4, device=self.method.device)
-            ahead[:3, 3] = ahead.new_tensor([0.0, 0.0, 1.0]) - self.method.object_model.center.to(
-                ahead
-            )
-            state = begin(
-                BeliefBatch(
-                    ahead[None, None], ahead.new_zeros(1, 1), ahead[None], ahead.new_zeros(1)
-                )
-            )
+            center = self.method.object_model.center.to(ahead)
+            ahead[:3, 3] = ahead.new_tensor([0.0, 0.0, 1.0]) - center
+            one, zero = ahead[None], ahead.new_zeros(1)
+            state = begin(BeliefBatch(one[None], zero[None], one, zero))
         score = state.best.new_full((1,), -torch.inf)
         score = score if sight.belief is None else sight.belief.score
         belief = BeliefBatch(state.belief.state, state.belief.log_weights, state.best, score)
         if measured:
             belief, draws = self.method.calibrate_belief(belief, sight.found)
         trace = Trace((), (), (), belief)
-        return Run(
-            self.method,
-            sight.batch,
-            trace,
-            0.0,
-            sight.found,
-            size=sight.size,
-            blank=[blank],
-            draws=draws,
-        )
+        return Run(self.method, sight.batch, trace, 0.0, sight.found, sight.size, [blank], draws)
 
 
 def begin(belief: BeliefBatch) -> State:

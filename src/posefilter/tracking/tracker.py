@@ -8,13 +8,7 @@ import torch
 
 from posefilter.errors import UserError, check_seed
 from posefilter.estimator import Estimator, get_trained_size
-from posefilter.images import (
-    Images,
-    as_array,
-    check_depth_unit,
-    check_images,
-    check_intrinsics,
-)
+from posefilter.images import Images, as_array, check_depth_unit, check_images, check_intrinsics
 from posefilter.tracking.frame import Frame
 from posefilter.tracking.processes import MultiprocessTracker
 from posefilter.tracking.settings import TrackerSettings
