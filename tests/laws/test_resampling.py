@@ -1,6 +1,7 @@
 """Every resampler keeps the weighted mean and hands out normalized weights."""
 
 import math
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -304,6 +305,7 @@ def test_what_needs_one_ancestor_a_child_refuses_mixtures() -> None:
     particles = cloud_of(2, 20)
     with pytest.raises(UserError, match="needs a scheme that draws ancestors"):
         Islands(EnsembleTransform(), 5)(particles, 20, SPACE, Generator())
-    auxiliary = AuxiliaryResampling(EnsembleTransform())
+    seen = SimpleNamespace(objectness=torch.ones(2, 1, 6, 8))
+    draw = AuxiliaryResampling(EnsembleTransform()).bind(seen, 60, 80)
     with pytest.raises(UserError, match="children have one ancestor"):
-        auxiliary.draw(particles, torch.zeros(2, 20), 20, SPACE, Generator())
+        draw(particles, 20, SPACE, Generator())

@@ -92,15 +92,14 @@ class Belief:
             raise UserError(f"belief: the weights should be positive and sum to 1, not {total:.6g}")
         if abs(total - 1) > _ROUNDING:  # as of single precision
             object.__setattr__(self, "weights", self.weights / total)
-        if not np.isfinite(self.samples).all() or not is_rigid(torch.from_numpy(self.samples)):
-            raise UserError("belief: the samples should be rigid transforms")
         group = self.symmetries
         if group.shape[1:] != (4, 4) or not 1 <= len(group) <= _MOST_SYMMETRIES:
             raise UserError(
                 f"belief: symmetries {group.shape} should be (S, 4, 4), {_MOST_SYMMETRIES} at most"
             )
-        if not np.isfinite(group).all() or not is_rigid(torch.from_numpy(group)):
-            raise UserError("belief: the symmetries should be rigid transforms")
+        for name, poses in (("samples", self.samples), ("symmetries", group)):
+            if not np.isfinite(poses).all() or not is_rigid(torch.from_numpy(poses)):
+                raise UserError(f"belief: the {name} should be rigid transforms")
         if self.center.shape != (3,) or not np.isfinite(self.center).all():
             raise UserError(f"belief: the center should be three numbers, not {self.center}")
         if not isinstance(self.draws, Integral) or not 0 <= self.draws <= count:

@@ -14,14 +14,7 @@ from posefilter.types import Batch, Particles, Resampled
 def gather_objectness(objectness: Tensor, state: Tensor, height: int, width: int) -> Tensor:
     """Return the objectness of the cell that each particle lies in; off the frame, of the nearest.
 
-    Args:
-        objectness: (B, 1, h, w) map over the image.
-        state: (B, N, 2) particles [px].
-        height: The image's height [px].
-        width: The image's width [px].
-
-    Returns:
-        Objectness (B, N).
+    A map (B, 1, h, w) over an image of height x width [px], particles (B, N, 2) [px] -> (B, N).
     """
     h, w = objectness.shape[-2:]
     fraction = (state.detach() + 0.5) / state.new_tensor([width, height])
@@ -63,13 +56,7 @@ class AuxiliaryResampling:
         self.floor = floor
 
     def bind(self, encoding: HasObjectness, height: int, width: int) -> Resample:
-        """Return the resampler for one encoding.
-
-        Args:
-            encoding: The encoded images.
-            height: The images' height [px].
-            width: The images' width [px].
-        """
+        """Return the resampler for encoded images of height x width [px]."""
         objectness = encoding.objectness.detach()
 
         def resample(
@@ -77,30 +64,18 @@ class AuxiliaryResampling:
         ) -> Resampled:
             values = gather_objectness(objectness, particles.state, height, width)
             log_auxiliary = values.clamp_min(self.floor).log()
-            return self.draw(particles, log_auxiliary, count, space, generator)
+            log_weights = torch.log_softmax(particles.log_weights + log_auxiliary, dim=1)
+            weighted = particles._replace(log_weights=log_weights)
+            resampled = self.resampler(weighted, count, space, generator)
+            if resampled.mixture_weights is not None:
+                raise UserError(
+                    "filter/resample=auxiliary needs a resampler whose children have one ancestor "
+                    "each; choose systematic"
+                )
+            log_weights = resampled.log_weights - log_auxiliary.gather(1, resampled.ancestors)
+            return resampled._replace(log_weights=torch.log_softmax(log_weights, dim=1))
 
         return resample
-
-    def draw(
-        self,
-        particles: Particles,
-        log_auxiliary: Tensor,
-        count: int,
-        space: Space,
-        generator: Generator,
-    ) -> Resampled:
-        """Return children drawn by weight x the auxiliary function, whose log is (B, M)."""
-        log_weights = torch.log_softmax(particles.log_weights + log_auxiliary, dim=1)
-        resampled = self.resampler(
-            particles._replace(log_weights=log_weights), count, space, generator
-        )
-        if resampled.mixture_weights is not None:
-            raise UserError(
-                "filter/resample=auxiliary needs a resampler whose children have one ancestor "
-                "each; choose systematic"
-            )
-        log_weights = resampled.log_weights - log_auxiliary.gather(1, resampled.ancestors)
-        return resampled._replace(log_weights=torch.log_softmax(log_weights, dim=1))
 
     def __call__(
         self, particles: Particles, count: int, space: Space, generator: Generator

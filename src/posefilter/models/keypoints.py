@@ -86,10 +86,7 @@ class Keypoints(Hypotheses):
         """Solve for poses that put keypoints at peaks.
 
         Where none is found, the pose is that of an unturned object 1 m deep, behind the highest
-        peak of its center: its score is low.
-
-        Returns:
-            camera_from_object (B, particles, 4, 4) [m].
+        peak of its center: its score is low.  -> camera_from_object (B, particles, 4, 4) [m].
         """
         pixels, heights = find_peaks(encoding.maps.detach(), self.peaks, encoding.stride)
         drawn, rows = self.draw_subsets(heights, particles, generator)
@@ -101,10 +98,7 @@ class Keypoints(Hypotheses):
             rows.cpu().numpy(),
             strict=True,
         )
-        poses = [
-            self.solve(points, image, height, K, few, row, default)
-            for image, height, K, default, few, row in images
-        ]
+        poses = [self.solve(points, *image) for image in images]
         return torch.from_numpy(np.stack(poses)).to(encoding.logits)
 
     def draw_subsets(
@@ -112,13 +106,7 @@ class Keypoints(Hypotheses):
     ) -> tuple[Tensor, Tensor]:
         """Draw keypoints for hypotheses, and a peak of each keypoint's map.
 
-        Args:
-            heights: (B, 9, peaks).
-            count: Number of hypotheses.
-            generator: Source of randomness.
-
-        Returns:
-            Keypoints (B, count, subset), and peaks (B, count, 9), int64.
+        Heights (B, 9, peaks) -> keypoints (B, count, subset), and peaks (B, count, 9), int64.
         """
         B = len(heights)
         chances = heights[..., 0].clamp_min(1e-4)[:, None].expand(-1, count, -1).flatten(0, 1)
@@ -133,9 +121,9 @@ class Keypoints(Hypotheses):
         pixels: np.ndarray,
         heights: np.ndarray,
         K: np.ndarray,
+        default: np.ndarray,
         chosen: np.ndarray,
         peaks: np.ndarray,
-        default: np.ndarray,
     ) -> np.ndarray:
         """Return one image's hypotheses (count, 4, 4); `default` (4, 4) where there is none."""
         sure = heights[:, 0] > _LEAST

@@ -3,6 +3,7 @@
 import torch
 from torch import Generator, Tensor
 
+from posefilter.geometry.pose import take_poses
 from posefilter.geometry.pose_statistics import twist_between
 from posefilter.geometry.spaces import PoseSpace
 from posefilter.protocols import Encoding, Method
@@ -34,28 +35,19 @@ class ModeMean:
         """Return the belief."""
         space, poses = method.space, output.pose
         assert isinstance(space, PoseSpace)
-        rows = torch.arange(len(poses), device=poses.device)
-        top = poses[rows, particles.log_weights.argmax(1)]
-        near = space.distance(poses, top[:, None]) < self.max_distance
+        top = take_poses(poses, particles.log_weights.argmax(1, keepdim=True))
+        near = space.distance(poses, top) < self.max_distance
         weights = torch.where(near, particles.log_weights, -torch.inf).softmax(1)
         score = (weights * output.log_likelihood).sum(1)
         return BeliefBatch(poses, particles.log_weights, space.mean(poses, weights), score)
 
 
 def smooth(predicted: Tensor, measured: Tensor, space: PoseSpace, noise: float) -> Tensor:
-    """Return a pose between what was predicted and what was measured.
+    """Return a pose between what was predicted and what was measured.  (B, 4, 4) x 2 -> (B, 4, 4).
 
-    The share of the measured is d^2 / (d^2 + noise^2), where d is the distance of the two: what
-    measurement noise explains is damped, and a motion is followed.
-
-    Args:
-        predicted: (B, 4, 4) camera_from_object [m].
-        measured: (B, 4, 4) likewise.
-        space: Measures the distance.
-        noise: Standard deviation of the estimate of a single frame [m]; 0 for no smoothing.
-
-    Returns:
-        Poses (B, 4, 4).
+    The share of the measured is d^2 / (d^2 + noise^2), where d is the distance of the two, and
+    noise the standard deviation of the estimate of a single frame [m]: what measurement noise
+    explains is damped, and a motion is followed.
     """
     square = space.distance(predicted, measured).square()[:, None]
     share = square / (square + noise**2).clamp_min(1e-20)
