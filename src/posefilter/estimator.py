@@ -168,15 +168,8 @@ class Estimator:
                 spent = seconds[number] / many[number]
                 method, batch = self.methods[number], batches[number]
                 belief, draws = method.calibrate_belief(each.belief, each.assessment)
-                run = Run(
-                    method,
-                    batch,
-                    Trace((), (), (), belief),
-                    spent,
-                    each.assessment,
-                    blank=blank[i : i + 1],
-                    draws=draws,
-                )
+                trace = Trace((), (), (), belief)
+                run = Run(method, batch, trace, spent, each.assessment, draws=draws)
                 result = make_result(run, 0, self.costs, self.pose_tolerance)
                 mask = resize_mask(each.mask, size).cpu().numpy()
                 # a conformal set holds for the filter that was calibrated, this one is smaller

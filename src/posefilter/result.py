@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import KW_ONLY, dataclass, field
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -85,18 +85,19 @@ class Result:
     warnings: tuple[str, ...]
     seconds: float
     object_model: ObjectModel
-    costs: Costs = field(default_factory=Costs, kw_only=True)
-    pose_tolerance: PoseTolerance | None = field(default=None, kw_only=True)
-    calibration: Calibration | None = field(default=None, kw_only=True)
-    features: Mapping[str, float] = field(default_factory=dict, kw_only=True)
-    calibration_note: str = field(default="", kw_only=True)
-    conformal: Conformal | None = field(default=None, kw_only=True)
-    depth_inlier_fraction: float = field(default=math.nan, kw_only=True)
-    apparent_size: float = field(default=math.nan, kw_only=True)
-    wrong_size: bool = field(default=False, kw_only=True)
-    blank: str = field(default="", kw_only=True)
-    instance: int = field(default=0, kw_only=True)
-    mask: np.ndarray | None = field(default=None, kw_only=True)
+    _: KW_ONLY
+    costs: Costs = field(default_factory=Costs)
+    pose_tolerance: PoseTolerance | None = None
+    calibration: Calibration | None = None
+    features: Mapping[str, float] = field(default_factory=dict)
+    calibration_note: str = ""
+    conformal: Conformal | None = None
+    depth_inlier_fraction: float = math.nan
+    apparent_size: float = math.nan
+    wrong_size: bool = False
+    blank: str = ""
+    instance: int = 0
+    mask: np.ndarray | None = None
 
     def __repr__(self) -> str:
         place = ", ".join(f"{x:.3f}" for x in self.pose[:3, 3])
@@ -343,7 +344,10 @@ def make_result(
 ) -> Result:
     """Return what a run amounts to for one image of its batch."""
     object_model, belief, found = run.method.object_model, run.trace.belief, run.found
-    calibration = None if found is None else run.method.calibration
+    calibration, note = run.method.calibration, ""
+    if found is None:
+        note = run.method.calibration_note if calibration is None else "the frame shows nothing"
+        calibration = None
     features = {} if found is None or found.features is None else found.features
     values = {name: float(value[image]) for name, value in features.items()}
     pose = belief.best[image].double().cpu().numpy()
@@ -371,7 +375,7 @@ def make_result(
         pose_tolerance=pose_tolerance,
         calibration=calibration,
         features=values,
-        calibration_note="" if found is not None else explain_missing(run.method),
+        calibration_note=note,
         conformal=None if calibration is None else calibration.conformal,
         depth_inlier_fraction=values.get("surface", math.nan),
         apparent_size=size,
@@ -402,9 +406,3 @@ def make_belief(
         object_model.symmetries.detach().cpu().double().numpy(),
         0 if draws is None else int(draws[image]),
     )
-
-
-def explain_missing(method: PoseEstimator) -> str:
-    """Return why an estimate has no probability."""
-    known = method.calibration is not None
-    return "the frame shows nothing" if known else method.calibration_note
