@@ -14,6 +14,7 @@ from posefilter.confidence.logistic import fit_logistic
 from posefilter.confidence.tolerance import RIGHT, PoseErrors
 from posefilter.errors import UserError
 
+_FOLDS = 5  # of cross-validation
 FEWEST = 10  # frames with the object, and without
 
 
@@ -165,25 +166,19 @@ def _find_standard(
     return tuple(np.nanmean(frames.values, 0).tolist()), tuple(scale.tolist())
 
 
-def cross_validate(
-    frames: Frames, folds: int = 5, seed: int = 0, first: Calibration | None = None
-) -> Assessment:
+def cross_validate(frames: Frames, first: Calibration | None = None) -> Assessment:
     """Return the probabilities of frames, each by a calibration that has not seen it.
 
-    Args:
-        frames: n frames.
-        folds: Parts, each with its share of right, wrong and absent frames.
-        seed: Of their shuffle.
-        first: As of `fit_calibration`.
+    Each fold has its share of right, wrong and absent frames; `first` is as of `fit_calibration`.
     """
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     kind = frames.present.astype(int) + frames.correct
     fold = np.empty(len(kind), int)
     for one in np.unique(kind):
         own = np.flatnonzero(kind == one)
-        fold[rng.permutation(own)] = np.arange(len(own)) % folds
+        fold[rng.permutation(own)] = np.arange(len(own)) % _FOLDS
     presence, probability = torch.zeros(2, len(kind), dtype=torch.float64)
-    for k in range(folds):
+    for k in range(_FOLDS):
         held = np.flatnonzero(fold == k)
         if not len(held):
             continue

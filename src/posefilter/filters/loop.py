@@ -160,7 +160,8 @@ class ParticleFilter(nn.Module):
         ancestor_log_likelihood = torch.zeros_like(particles.log_weights)
         resample = bind_to_encoding(self.resample, encoding, batch)
         output: ParticleOutput | None = None
-        for step in self.make_steps(state):
+        for number, sigma in enumerate(self.schedule(self.steps)):
+            step = Step(number, self.steps, state.new_tensor(sigma))
             if output is not None:
                 resampled = resample(particles, self.particles, method.space, generator)
                 state = inherit(particles.state, resampled, method.space)
@@ -196,13 +197,6 @@ class ParticleFilter(nn.Module):
         belief = self.estimate(particles[-1], outputs[-1], encoding, method, generator)
         belief = self.refine(belief, encoding, method, generator)
         return Trace(particles, outputs, steps, belief, log_evidence, encoding)
-
-    def make_steps(self, like: Tensor) -> tuple[Step, ...]:
-        """Return the steps with their noise levels, in the dtype and on the device of `like`."""
-        levels = self.schedule(self.steps)
-        return tuple(
-            Step(number, self.steps, like.new_tensor(sigma)) for number, sigma in enumerate(levels)
-        )
 
 
 def make_particles(state: Tensor, latent_width: int) -> Particles:

@@ -150,7 +150,8 @@ def _evaluate(density: PoseDensity, poses: Tensor, own: Tensor | None) -> Tensor
     """Return the log density at poses (M, 4, 4), without the kernels `own` (M,).  -> (M,)."""
     copies = poses[:, None] @ density.symmetries
     at = split_poses(copies.flatten(0, 1), density.center)
-    log_kernel = _log_kernel(density, pair_twists(density.poses, at))
+    square, log_volume = _measure(density, pair_twists(density.poses, at))
+    log_kernel = density.log_scale[:, None] - 0.5 * square - log_volume
     copies_of = len(density.symmetries)
     log_kernel = log_kernel.unflatten(1, (-1, copies_of)).logsumexp(2) - math.log(copies_of)
     return _mix(density, log_kernel, at.center.unflatten(0, (-1, copies_of)), own)
@@ -185,12 +186,6 @@ def _with_background(density: PoseDensity, log_mixture: Tensor, offset: Tensor) 
     cauchy = -2 * ratio.log1p() - 3 * math.log(density.diameter) - 4 * math.log(math.pi)
     background = cauchy.logsumexp(1) - math.log(offset.shape[1]) + math.log(BACKGROUND)
     return torch.logaddexp(log_mixture + math.log1p(-BACKGROUND), background)
-
-
-def _log_kernel(density: PoseDensity, twist: Tensor) -> Tensor:
-    """Return the kernels' log densities at twists from their poses.  (N, M, 6) -> (N, M)."""
-    square, log_volume = _measure(density, twist)
-    return density.log_scale[:, None] - 0.5 * square - log_volume
 
 
 def _measure(density: PoseDensity, twist: Tensor) -> tuple[Tensor, Tensor]:

@@ -22,17 +22,6 @@ def log1mexp(log_p: Tensor) -> Tensor:
     return torch.log(-torch.expm1(log_p.clamp(max=-1e-35)))
 
 
-def stack_log_likelihoods(trace: Trace, steps: str) -> Tensor:
-    """Return the log-likelihoods of the last step, or of all steps.  -> (S, B, N).
-
-    Raises:
-        UserError: `steps` is neither "last" nor "all".
-    """
-    check_choice("loss.steps", steps, "last", "all")
-    outputs = trace.outputs if steps == "all" else trace.outputs[-1:]
-    return torch.stack([output.log_likelihood for output in outputs])
-
-
 class Bce:
     """Binary cross-entropy with labels in [0, 1] (the paper, eq. 3, with its missing minus sign).
 
@@ -54,7 +43,9 @@ class Bce:
 
     def _compare(self, trace: Trace, batch: Batch, object_model: ObjectModel) -> tuple[Tensor, ...]:
         """Return log-likelihoods, labels and their cross-entropy, each (S, B, N)."""
-        log_p = stack_log_likelihoods(trace, self.steps)
+        check_choice("loss.steps", self.steps, "last", "all")
+        outputs = trace.outputs if self.steps == "all" else trace.outputs[-1:]
+        log_p = torch.stack([output.log_likelihood for output in outputs])
         y = self.label(trace, batch, object_model)[-len(log_p) :]
         return log_p, y, -(y * log_p + (1 - y) * log1mexp(log_p))
 

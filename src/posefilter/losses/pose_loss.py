@@ -14,7 +14,7 @@ from posefilter.geometry.pose import invert, transform
 from posefilter.geometry.pose_error import add_distance, add_s_distance, subsample
 from posefilter.losses.likelihood import log1mexp
 from posefilter.protocols import Label
-from posefilter.types import Batch, Fragments, ObjectModel, ParticleOutput, Particles, Trace
+from posefilter.types import Batch, ObjectModel, ParticleOutput, Particles, Trace
 
 
 class Add:
@@ -119,18 +119,10 @@ class SurfacePointLoss:
                 error = ((guess - true).square().sum(-1) + 1e-12).sqrt() / object_model.radius
             else:
                 relative = (true - object_model.center.to(true)) / object_model.radius
-                error = self._of_fragments(output.fragments, relative)
+                nll, offset = fragment_errors(*output.fragments, relative)
+                error = self.fragment_weight * (nll + self.offset_weight * offset)
             total = total + (error * counts).sum(1) / counts.sum(1).clamp_min(1)
         return total / len(trace.outputs)
-
-    def _of_fragments(self, fragments: Fragments, true: Tensor) -> Tensor:
-        """Return the loss of fragments.  True points (B, N, 3) from the center, in radii -> (B,
-        N).
-        """
-        nll, error = fragment_errors(
-            fragments.log_prob, fragments.position, fragments.centers, fragments.mean_radius, true
-        )
-        return self.fragment_weight * (nll + self.offset_weight * error)
 
 
 def measured_points(

@@ -5,5 +5,3 @@ from posefilter.models.image_space import ImageSpace
 
 class CnnPatch(ImageSpace):
     """A particle's patch passes three convolutions; the output is an offset and a likelihood."""
-
-    position_width = 0

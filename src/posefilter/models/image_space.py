@@ -114,7 +114,12 @@ class ImageSpace(PoseEstimator):
         self.loss_schedule = tuple(loss_schedule or ())
         check_loss_schedule(self.loss_schedule, ["loss", "objectness", *(aux_losses or {})])
         for component in (box_head, *(aux.loss for aux in self.aux_losses.values())):
-            check_latent_width(self.latent_width, getattr(component, "latent_width", None))
+            required = getattr(component, "latent_width", None)
+            if required not in (None, self.latent_width):
+                raise UserError(
+                    f"model.net.latent_width={self.latent_width}: model/box_head=votes needs "
+                    f"{required}, one for each of the box's sides"
+                )
         self.objectness_weight = objectness_weight
         self.detach_position = detach_position
         self.truncate = truncate
@@ -253,15 +258,6 @@ class ImageSpace(PoseEstimator):
     def box(self, trace: Trace, batch: Batch) -> Tensor:
         """Return the bounding box that the box head computes, (B, 4) [px]."""
         return self.box_head(trace, batch, self.object_model)
-
-
-def check_latent_width(width: int, required: int | None) -> None:
-    """Raise UserError where the latent has not the width that a component requires; None: any."""
-    if required not in (None, width):
-        raise UserError(
-            f"model.net.latent_width={width}: model/box_head=votes needs {required}, one for each "
-            "of the box's sides"
-        )
 
 
 def check_particle_counts(rolled: ParticleFilter, name: str) -> None:

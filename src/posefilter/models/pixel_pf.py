@@ -13,5 +13,3 @@ class PixelPF(ImageSpace):
     """
 
     requires: ClassVar[Capabilities] = ("pose",)
-
-    position_width = 0

@@ -60,7 +60,9 @@ def check_method(method: PoseEstimator, seen: Batch, learned: Batch | None) -> N
         _check_checkpoint(twin)
         _Watcher(twin).watch()
         _look(twin.eval(), seen)
-        if learned is not None and not _is_prepared_by_trainer(twin):
+        # a method may have work of its own to do before a training's first step
+        prepare = getattr(type(twin), "on_fit_start", None)
+        if learned is not None and prepare in (None, LightningModule.on_fit_start):
             _learn(twin.train(), learned)
 
 
@@ -70,11 +72,6 @@ def _look(method: PoseEstimator, seen: Batch) -> None:
     _check_tensor(
         f"{type(method).__name__}.box", "what it returned", box, (len(seen.rgb), 4), torch.float64
     )
-
-
-def _is_prepared_by_trainer(method: PoseEstimator) -> bool:
-    """Tell whether a method has work of its own to do before a training's first step."""
-    return getattr(type(method), "on_fit_start", None) not in (None, LightningModule.on_fit_start)
 
 
 def _learn(method: PoseEstimator, learned: Batch) -> None:
