@@ -10,11 +10,16 @@ import pytest
 from matplotlib.figure import Figure
 from omegaconf import OmegaConf
 
+from posefilter.cli import run_command
+from posefilter.cli.folders import note_failure
+from posefilter.cli.job import Job as Run
 from posefilter.cli.sweeps import SweepSummary, list_rows, summarize
 from posefilter.errors import Carrier
 from posefilter.metrics.registry import PERCENT
 from posefilter.report.summary import draw_summary
 from posefilter.report.sweeps import Job, Sweep, read_sweep
+
+HOME = Path(__file__).parents[2]
 
 
 def sweep(folder: Path, key: str, words: list[str]) -> Path:
@@ -119,3 +124,23 @@ def test_one_seed_is_no_trend(tmp_path: Path, words: list[str]) -> None:
 
 def test_nothing_to_compare_is_no_figure(tmp_path: Path) -> None:
     assert draw_summary(Sweep(tmp_path, [], [Job({}, {"add/auc": 50.0}, "a")], [])) is None
+
+
+def test_a_job_that_was_started_again_meanwhile_has_not_failed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """The second start is refused, and notes that down in the folder that the first one holds."""
+
+    def end(job: Run) -> float:
+        note_failure(job, "is in use by another run")
+        metrics = {"overrides": job.overrides, "iou": 0.5}
+        (job.folder / "metrics.json").write_text(json.dumps(metrics))
+        return 0.5
+
+    monkeypatch.setattr("posefilter.cli.train.train", end)
+    monkeypatch.setattr("posefilter.cli.running.check_files", lambda name, cfg: None)
+    words = ["-m", "seed=1,2", "logger=none", "console=json", f"out={tmp_path}"]
+    assert run_command("train", HOME, words) == 0
+    assert json.loads(capfd.readouterr().out.splitlines()[-1])["failed"] == []
+    assert not [*tmp_path.rglob("failed.json")]
+    assert len(read_sweep(tmp_path).jobs) == 2

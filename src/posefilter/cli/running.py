@@ -72,7 +72,9 @@ def run_job(cfg: DictConfig, name: str, begun: list[Job], kept: list[Job]) -> An
         if not job.swept:  # before torch is imported, which takes seconds
             say(console, "started", f"{name}: starting", command=name, folder=str(job.folder))
         work: Work = getattr(importlib.import_module(f"posefilter.cli.{name}"), name)
-        return work(job)
+        result = work(job)
+        forget_failure(job)  # of the same job, started while this one held the folder
+        return result
     except Exception as error:
         if type(error).__name__ == "OutOfMemoryError":  # torch's, of a GPU
             error = MemoryError(str(error))
