@@ -1,5 +1,6 @@
 """What a trainer may be told."""
 
+import signal
 import warnings
 from pathlib import Path
 
@@ -13,6 +14,47 @@ from posefilter.errors import UserError
 
 HOME = Path(__file__).parents[2]
 SETTINGS = {"_target_": "lightning.Trainer", "accelerator": "cpu", "max_steps": 1}
+SLURM = {
+    "SLURM_JOB_ID": "7", "SLURM_JOB_NAME": "box", "SLURM_NTASKS": "1", "SLURM_PROCID": "0",
+    "SLURM_LOCALID": "0", "SLURM_NODEID": "0",
+}  # fmt: skip
+
+
+@pytest.fixture
+def in_slurm(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name, value in SLURM.items():
+        monkeypatch.setenv(name, value)
+
+
+@pytest.mark.usefixtures("in_slurm")
+def test_a_job_of_slurm_is_not_started_anew_behind_the_users_back() -> None:
+    """At SIGUSR1 Lightning's own handler calls `scontrol requeue`."""
+    connector = make_trainer(OmegaConf.create({**SETTINGS}), [])._signal_connector
+    before = signal.getsignal(signal.SIGUSR1)
+    connector.register_signal_handlers()
+    try:
+        assert signal.getsignal(signal.SIGUSR1) == before
+    finally:
+        connector.teardown()
+
+
+@pytest.mark.usefixtures("in_slurm")
+def test_a_checkpoint_that_would_be_tested_in_place_of_the_best_is_told(tmp_path: Path) -> None:
+    """Lightning looks for one of that name in a job of Slurm, and loads it before a test."""
+    settings = OmegaConf.create({**SETTINGS, "default_root_dir": str(tmp_path)})
+    make_trainer(settings, [])
+    (tmp_path / "hpc_ckpt_1.ckpt").touch()
+    with pytest.raises(UserError, match=r"hpc_ckpt_1\.ckpt: in a job of Slurm .* move it away"):
+        make_trainer(settings, [])
+
+
+def test_one_of_several_processes_does_not_train_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It would write no results, and end as if all were well."""
+    monkeypatch.setattr("posefilter.cli.build.is_follower", lambda: True)
+    with pytest.raises(UserError, match=r"trainer\.devices=1: this is one of several processes"):
+        make_trainer(OmegaConf.create({**SETTINGS, "devices": 1}), [])
+    strategy = {"devices": 2, "strategy": "ddp"}
+    assert make_trainer(OmegaConf.create({**SETTINGS, **strategy}), []).world_size == 2
 
 
 @pytest.mark.parametrize("precision", ["bf16-mixed", "16-true", "64-true"])

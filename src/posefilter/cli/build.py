@@ -9,6 +9,7 @@ from typing import Any
 import torch
 from lightning import Callback, Trainer
 from lightning.pytorch.loggers import Logger, TensorBoardLogger
+from lightning.pytorch.plugins.environments import SLURMEnvironment
 from omegaconf import DictConfig, OmegaConf
 
 from posefilter.callbacks.tensorboard_layout import TensorBoardLayout
@@ -19,6 +20,7 @@ from posefilter.cli.instantiate import instantiate
 from posefilter.cli.job import Job
 from posefilter.cli.plain import key_of, resolve
 from posefilter.cli.progress_bar import progress
+from posefilter.cli.ranks import is_follower
 from posefilter.cli.stopping import Stop
 from posefilter.data.module import PoseDataModule
 from posefilter.devices import choose_device
@@ -136,7 +138,12 @@ def _build_all(node: DictConfig, where: str) -> list[Any]:
 def make_trainer(
     node: DictConfig, callbacks: list[Callback], loggers: list[Logger] | None = None
 ) -> Trainer:
-    """Build a trainer of its settings; refuse those that would blur poses."""
+    """Build a trainer of its settings.
+
+    Raises:
+        UserError: They would blur poses, they have one process of several that were started train
+            alone, or Lightning would test another checkpoint.
+    """
     precision = node.get("precision", "32-true")
     if str(precision) not in ("32-true", "32"):
         raise UserError(
@@ -156,7 +163,32 @@ def make_trainer(
         enable_progress_bar=False,
     )
     assert isinstance(trainer, Trainer)
+    if is_follower() and trainer.world_size == 1:
+        raise UserError(
+            f"trainer.devices={node.get('devices')}: this is one of several processes that srun or "
+            "torchrun has started, and only the first writes results; give trainer.devices= their "
+            "number, or, for runs that are independent, start each by itself (srun --ntasks=1)"
+        )
+    _keep_from_requeueing(trainer)
     return trainer
+
+
+def _keep_from_requeueing(trainer: Trainer) -> None:
+    """Keep Lightning from its own way to go on with a job of Slurm: at SIGUSR1 it would have the
+    command started anew, which is no resuming, and it would test what it had then written,
+    `hpc_ckpt_1.ckpt`, in place of the method that it is given.
+
+    Raises UserError where such a file is there.
+    """
+    environment = trainer._accelerator_connector.cluster_environment
+    if isinstance(environment, SLURMEnvironment):
+        environment.auto_requeue = False
+    found = sorted(Path(trainer.default_root_dir).glob("hpc_ckpt_*"))
+    if found and SLURMEnvironment.detect():
+        raise UserError(
+            f"{found[0]}: in a job of Slurm Lightning would test this checkpoint, whatever is to "
+            "be tested; move it away"
+        )
 
 
 def quiet() -> None:
