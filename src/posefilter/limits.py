@@ -60,11 +60,24 @@ def read_lines(path: Path, max_bytes: int = 1 << 22) -> list[str]:
     Raises:
         BadData: The file is missing, larger, may not be read, or is not UTF-8.
     """
+    lines = read_text(path, max_bytes).splitlines()
+    return [line.strip() for line in lines if line.strip()]
+
+
+def read_text(path: Path, max_bytes: int = MOST_BYTES) -> str:
+    """Read a text file as it is.
+
+    Args:
+        path: The file.
+        max_bytes: Bytes that such a file may have.
+
+    Raises:
+        BadData: The file is missing, larger, may not be read, or is not UTF-8.
+    """
     try:
-        lines = read_bytes(path, max_bytes).decode().splitlines()
+        return read_bytes(path, max_bytes).decode()
     except UnicodeDecodeError as error:
         raise BadData(path, "not a text in UTF-8", str(error)) from error
-    return [line.strip() for line in lines if line.strip()]
 
 
 def read_json(

@@ -3,6 +3,7 @@ estimate (<https://bop.felk.cvut.cz/challenges>, "Formats").
 """
 
 import csv
+import io
 import math
 from collections.abc import Sequence
 from decimal import Decimal, InvalidOperation
@@ -13,6 +14,7 @@ import numpy as np
 
 from posefilter.errors import UserError
 from posefilter.files import open_whole_text
+from posefilter.limits import read_text
 
 _NEAREST = 0.02  # [m] median distance of objects
 HEADER = ("scene_id", "im_id", "obj_id", "score", "R", "t", "time")
@@ -82,12 +84,17 @@ def read_poses_csv(path: Path) -> list[PoseRow]:
     if not path.is_file():
         raise UserError(f"estimates={path}: no such file")
     rows = []
-    with path.open(newline="", encoding="utf-8", errors="replace") as file:
-        for number, cells in enumerate(csv.reader(file), start=1):
+    table = csv.reader(io.StringIO(read_text(path), newline=""))
+    try:
+        for number, cells in enumerate(table, start=1):
             first = cells[0].strip().lstrip("\ufeff").lower() if cells else ""
             if not any(map(str.strip, cells)) or (number == 1 and first == HEADER[0]):
                 continue
             rows.append(_parse(cells, f"{path}, line {number}"))
+    except csv.Error as error:
+        raise UserError(
+            f"{path}, line {table.line_num}: is no line of a table ({error})"
+        ) from error
     away = [float(np.linalg.norm(row.camera_from_native[:3, 3])) for row in rows]
     if away and 0 < (median := float(np.median(away))) < _NEAREST:
         raise UserError(
@@ -131,8 +138,11 @@ def _numbers(cell: str, count: int, name: str, where: str) -> list[Decimal]:
         raise UserError(
             f"{where}: {name} has {len(numbers)} numbers, expected {count} separated by blanks"
         )
-    if name == "score" and numbers[0].is_nan():  # which has no place in an order
-        raise UserError(f"{where}: score is no number: {cell!r}")
-    if name in ("R", "t") and not all(number.is_finite() for number in numbers):
+    # NaN has no place in an order; a signaling one is not even one of time
+    if (name == "score" and numbers[0].is_nan()) or any(number.is_snan() for number in numbers):
+        raise UserError(f"{where}: {name} is no number: {cell!r}")
+    # what is finite to a Decimal may be too large for a float
+    finite = (number.is_finite() and math.isfinite(float(number)) for number in numbers)
+    if name in ("R", "t") and not all(finite):
         raise UserError(f"{where}: {name} is not finite: {cell!r}")
     return numbers
