@@ -25,13 +25,17 @@ import torch
 from posefilter.belief.storage import read_arrays
 from posefilter.cli.checkpoints import method_of, read_checkpoint
 from posefilter.cli.resume import overrides_of
+from posefilter.data.generated_scenes import ensure_scenes
+from posefilter.data.points import read_model_points
 from posefilter.data.readers.ycb_video_files import read_meta
 from posefilter.errors import UserError
 from posefilter.meshes import obj
 from posefilter.meshes.files import read_mesh
 from posefilter.meshes.symmetries import read_symmetries
+from posefilter.metrics.bop_results import read_poses_csv
 from posefilter.report.gather import read_run
 from posefilter.report.sweeps import read_sweep
+from posefilter.synthetic.generate import generate
 
 SECONDS, BYTES = 5, 1 << 30
 Save = Callable[[dict[str, Any]], Path]
@@ -292,6 +296,7 @@ RUNS = {
     "a number of 5,000 digits in YAML": (".hydra/config.yaml", "a: " + "9" * 5000),
     "a cell without an end": ("errors.csv", "scene_id\n" + "x" * 200_000),
     "an event of 2^60 bytes": ("events.out.tfevents.1", "\0" * 7 + "\x10" + "\0" * 4),
+    "one of a name that TensorBoard takes": ("a.tfevents", "\0" * 7 + "\x10" + "\0" * 4),
 }
 
 
@@ -304,18 +309,54 @@ def test_a_run_of_somebody_else_is_no_traceback(what: str, tmp_path: Path) -> No
 
 
 def test_a_file_without_an_end_is_not_read(tmp_path: Path) -> None:
-    for name in ("metrics.json", "x.obj", "x.ply", "models_info.json"):
+    names = ("metrics.json", "x.obj", "x.ply", "models_info.json", "a/errors.csv", "poses.csv")
+    for name in (*names, "b/summary.csv", "c/_generator.json", "d/figures/x.png", "m/points.xyz"):
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         with (tmp_path / name).open("wb") as file:
             file.truncate(1 << 36)  # takes no space on disk
+    for name in ("a/metrics.json", "d/metrics.json", "c/0.left.json"):
+        (tmp_path / name).write_text("{}")
     info = tmp_path / "models_info.json"
     reads: list[Callable[[], Any]] = [
         lambda: read_run(tmp_path),
+        lambda: read_run(tmp_path / "a"),
+        lambda: read_run(tmp_path / "d"),
+        lambda: read_sweep(tmp_path / "b"),
+        lambda: read_poses_csv(tmp_path / "poses.csv"),
+        lambda: ensure_scenes(tmp_path / "c", None),
+        lambda: read_model_points(tmp_path, tmp_path, "m", np.eye(4)),
         lambda: read_mesh(tmp_path / "x.obj", "x"),
         lambda: read_mesh(tmp_path / "x.ply", "x"),
         lambda: read_symmetries(info, "x", 1.0, 36),
     ]
     for read in reads:
         assert "too large" in refuse(read)
+
+
+@pytest.mark.parametrize("name", ["figures/x.png", "events.out.tfevents.1"])
+@pytest.mark.parametrize("kind", ["pipe", "device", "folder", "nothing"])
+def test_what_is_no_file_is_not_waited_for(name: str, kind: str, tmp_path: Path) -> None:
+    place = tmp_path / name
+    place.parent.mkdir(exist_ok=True)
+    (tmp_path / "metrics.json").write_text("{}")
+    if kind == "pipe":
+        os.mkfifo(place)
+    elif kind == "folder":
+        place.mkdir()
+    else:
+        place.symlink_to({"device": "/dev/zero", "nothing": tmp_path / "gone"}[kind])
+    if place.suffix == ".png":
+        assert read_run(tmp_path).pictures == []  # left out, as what a run lacks
+    else:
+        assert "is no event file" in refuse(lambda: read_run(tmp_path))
+
+
+@pytest.mark.parametrize("text", ["[" * 100_000, '{"frames": 1e999, "settings": {}}'])
+def test_a_record_of_rendered_scenes_is_no_traceback(text: str, tmp_path: Path) -> None:
+    (tmp_path / "0.left.json").write_text("{}")
+    (tmp_path / "_generator.json").write_text(text)
+    assert "not a generator's record" in refuse(lambda: ensure_scenes(tmp_path, None))
+    assert "not a generator's record" in refuse(lambda: generate(tmp_path, 1, object="carton"))
 
 
 SWEEPS = {

@@ -1,11 +1,11 @@
 """Make sure that the scenes which the project renders itself are there."""
 
-import json
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from posefilter.errors import UserError
+from posefilter.errors import BadData, UserError
+from posefilter.limits import read_json
 
 _MARK = "_generator.json"
 
@@ -41,8 +41,8 @@ def _count(root: Path) -> tuple[int, int]:
     if frames == 0 or not (root / _MARK).is_file():
         return frames, frames
     try:
-        return frames, int(json.loads((root / _MARK).read_bytes())["frames"])
-    except (OSError, KeyError, TypeError, ValueError) as error:
+        return frames, int(read_json(root / _MARK)["frames"])
+    except (BadData, KeyError, TypeError, ValueError, OverflowError) as error:
         raise UserError(
             f"{root / _MARK}: not a generator's record ({error}); delete the folder to render it "
             f"anew"

@@ -1,6 +1,7 @@
 """Errors of each image of a test, as a CSV table."""
 
 import csv
+import io
 import math
 from collections.abc import Sequence
 from pathlib import Path
@@ -10,6 +11,7 @@ import torch
 
 from posefilter.files import open_whole_text
 from posefilter.forms import MOST
+from posefilter.limits import read_text
 from posefilter.metrics.scores import summarize_rows
 
 FILE = "errors.csv"
@@ -49,10 +51,11 @@ def read_errors(path: Path) -> list[ImageError]:
 
     Raises:
         ValueError: Where a row is malformed.
+        BadData: It is larger than such a file can be, or no text.
     """
     try:
-        with path.open(newline="", encoding="utf-8") as file:
-            return [parse_row(row) for row in csv.DictReader(file)]
+        table = io.StringIO(read_text(path), newline="")
+        return [parse_row(row) for row in csv.DictReader(table)]
     except csv.Error as error:
         raise ValueError(str(error)) from error
 

@@ -52,9 +52,11 @@ def read_events(folder: Path) -> tuple[dict[str, Curve], list[StoredImage]]:
 
 
 def check_records(path: Path) -> None:
-    """Raise UserError where a record of an event file claims more bytes than one has: its reader
-    makes room for them first.
+    """Raise UserError where an event file is no file, which its reader would wait for, or where a
+    record of it claims more bytes than one has: its reader makes room for them first.
     """
+    if not path.is_file():
+        raise UserError(f"{path}: is no event file")
     size = path.stat().st_size
     with path.open("rb") as file:
         # a record: its length, a checksum of that, as many bytes, a checksum of those
@@ -103,8 +105,8 @@ def drop_repeats(events: list[tuple[int, float, float]]) -> Curve:
 
 
 def find_event_files(folder: Path) -> Iterator[Path]:
-    """Return the event files of a run."""
-    return folder.glob("events.out.tfevents.*")
+    """Return what TensorBoard takes for event files of a run."""
+    return folder.glob("*tfevents*")
 
 
 def select_unsaved(pictures: list[StoredImage], files: list[StoredImage]) -> list[StoredImage]:

@@ -34,7 +34,7 @@ def read_image_errors(folder: Path) -> list[ImageError]:
         return []
     try:
         return read_errors(path)
-    except (ValueError, UnicodeDecodeError) as error:
+    except ValueError as error:
         raise UserError(f"{path}: is no table of errors ({error})") from error
 
 

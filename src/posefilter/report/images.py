@@ -11,7 +11,7 @@ from typing import NamedTuple
 from PIL import Image, UnidentifiedImageError
 
 from posefilter.errors import BadData
-from posefilter.limits import check_picture
+from posefilter.limits import MOST_BYTES, check_picture, read_bytes
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".gif")
 SECTIONS = {  # the first whose words a picture's name has; what is in none is "more"
@@ -43,12 +43,18 @@ class StoredImage(NamedTuple):
 def read_images(folder: Path) -> list[StoredImage]:
     """Return the pictures of a folder, sorted by name as people count; empty where there is
     none.
+
+    Raises:
+        BadData: One may not be read, or all together are larger than the pictures of a run.
     """
     if not folder.is_dir():
         return []
-    files = [path for path in folder.iterdir() if path.suffix.lower() in SUFFIXES]
+    files = [one for one in folder.iterdir() if one.suffix.lower() in SUFFIXES and one.is_file()]
     files.sort(key=lambda path: sort_by_number(path.name))
-    return [StoredImage(p.stem, p.stem.replace("_", " "), p.read_bytes()) for p in files]
+    size = sum(path.stat().st_size for path in files)
+    if size > MOST_BYTES:
+        raise BadData(folder, "pictures too large", f"{size:,} bytes, at most {MOST_BYTES:,}")
+    return [StoredImage(p.stem, p.stem.replace("_", " "), read_bytes(p)) for p in files]
 
 
 def sort_by_number(name: str) -> list[tuple[int, str]]:

@@ -3,6 +3,7 @@ the seed as one.
 """
 
 import csv
+import io
 import math
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
@@ -13,6 +14,7 @@ from typing import NamedTuple
 
 from posefilter.errors import UserError
 from posefilter.forms import MOST
+from posefilter.limits import read_text
 from posefilter.metrics.scores import overall
 from posefilter.report.diagnostics import list_numbers
 from posefilter.report.gather import SWEEP_MARKS, read_json, read_part, read_texts, read_yaml
@@ -127,8 +129,7 @@ def read_jobs(folder: Path, found: Sequence[Path]) -> tuple[list[str], list[Job]
 def read_jobs_from_csv(path: Path) -> tuple[list[str], list[Job]]:
     """Return the same of a summary: columns of no known figure are axes."""
     try:
-        with path.open(newline="", encoding="utf-8") as file:
-            rows = list(csv.DictReader(file, restval=""))
+        rows = list(csv.DictReader(io.StringIO(read_text(path), newline=""), restval=""))
     except (csv.Error, ValueError) as error:
         raise UserError(f"{path}: is no table of runs ({error})") from error
     others = (*COLUMNS, "folder", "error")

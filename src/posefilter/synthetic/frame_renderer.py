@@ -1,7 +1,5 @@
 """Render the frames of a generated dataset; each depends on settings, seed and its number alone."""
 
-import json
-from collections.abc import Iterator
 from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
@@ -10,7 +8,8 @@ from typing import Any
 import cv2
 import numpy as np
 
-from posefilter.errors import UserError
+from posefilter.errors import BadData, UserError
+from posefilter.limits import read_json
 from posefilter.meshes.store import MeshStore
 from posefilter.rendering.embree import EmbreeRenderer
 from posefilter.rendering.renderer import Renderer
@@ -260,8 +259,8 @@ def _check_begun(folder: Path, settings: dict[str, Any]) -> None:
     if not path.is_file() or not any(folder.glob("[0-9]*.json")):
         return
     try:
-        there = json.loads(path.read_bytes())
-    except ValueError:
+        there = read_json(path)
+    except BadData:
         there = None
     if there != settings:
         raise UserError(

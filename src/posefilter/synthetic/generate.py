@@ -17,8 +17,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from posefilter.errors import UserError
+from posefilter.errors import BadData, UserError
 from posefilter.files import remove_parts
+from posefilter.limits import read_json
 from posefilter.locks import LOCK, hold, release
 from posefilter.meshes.mesh import Mesh
 from posefilter.meshes.parts import split_part
@@ -396,10 +397,10 @@ def _read_record(out: Path) -> _Record | None:
     if not path.is_file():
         return None
     try:
-        content = json.loads(path.read_bytes())
+        content = read_json(path)
         settings, frames = _with_defaults(content["settings"]), int(content["frames"])
         return _Record(settings, frames, content.get("mesh"))
-    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+    except (BadData, ValueError, KeyError, TypeError, AttributeError, OverflowError) as error:
         raise UserError(
             f"{path}: not a generator's record any more ({error}); choose another out="
         ) from error
