@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from posefilter.errors import UserError
+from posefilter.geometry.rigid import move
 from posefilter.limits import read_text
 from posefilter.paths import is_plain_name
 

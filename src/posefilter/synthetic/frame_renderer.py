@@ -1,5 +1,6 @@
 """Render the frames of a generated dataset; each depends on settings, seed and its number alone."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
