@@ -93,6 +93,6 @@ def run(session, given):
 
 
 if __name__ == "__main__":
-    place, *images = read_arguments()
+    place, *images = read_arguments("pixels")
     pose, score, _ = PixelFilter(place).estimate(*images)
     print(np.array2string(pose, precision=4, suppress_small=True), f"score {score:.2f}")

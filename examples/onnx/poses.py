@@ -463,29 +463,42 @@ def fit_rigid(source, target, weights):
     return poses
 
 
-def read_arguments():
-    """Folder, RGB (H, W, 3) uint8, depth (H, W) [m] and camera matrix of the command line."""
+def read_arguments(particles):
+    """Folder, RGB (H, W, 3) uint8, depth (H, W) [m] and camera matrix of the command line, for a
+    filter whose particles are "poses" or "pixels".
+    """
     import cv2
 
     if len(sys.argv) != 6:
-        sys.exit("usage: poses.py FOLDER RGB DEPTH fx,fy,cx,cy DEPTH_UNITS_A_METER")
+        sys.exit(f"usage: {particles}.py FOLDER RGB DEPTH fx,fy,cx,cy DEPTH_UNITS_A_METER")
     folder, rgb, depth, intrinsics, scale = sys.argv[1:]
     if not (Path(folder) / "filter.json").is_file():
         sys.exit(f"{folder}: no folder that export.py format=onnx wrote")
+    own = json.loads((Path(folder) / "filter.json").read_text())["particles_are"]
+    if own != particles:
+        sys.exit(f"{folder}: its particles are {own}; {own}.py runs it")
     try:
         fx, fy, cx, cy = map(float, intrinsics.split(","))
         units = float(scale)
     except ValueError:
         sys.exit(f"{intrinsics} {scale}: expected fx,fy,cx,cy [px] and the units in a meter")
+    if not units > 0:
+        sys.exit(f"{scale}: expected the depth image's units in a meter, above 0")
     color, z = cv2.imread(rgb), cv2.imread(depth, cv2.IMREAD_UNCHANGED)
     for name, image in ((rgb, color), (depth, z)):
         if image is None:
             sys.exit(f"{name}: no image that OpenCV reads")
+    if z.ndim != 2:
+        sys.exit(f"{depth}: has {z.shape[2]} channels, and depth has one")
+    if not z.any():
+        sys.exit(f"{depth}: no pixel has depth")
     color, z = cv2.cvtColor(color, cv2.COLOR_BGR2RGB), z / units
+    if not 0.05 <= (median := np.median(z[z > 0])) <= 30:
+        sys.exit(f"{scale}: the median depth would be {median:.3g} m; is it 1000 or 10000?")
     return folder, color, z, np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
 
 
 if __name__ == "__main__":
-    place, *images = read_arguments()
+    place, *images = read_arguments("poses")
     pose, score, *_ = PoseFilter(place).estimate(*images)
     print(np.array2string(pose, precision=4, suppress_small=True), f"score {score:.2f}")

@@ -412,21 +412,31 @@ def test_the_examples_import_neither_torch_nor_us(name: str) -> None:
 @pytest.mark.parametrize(
     ("typed", "told"),
     [
-        (["nothing", "a.png", "b.png", "1,1,1,1", "1"], "nothing: no folder that export.py"),
-        (["{folder}", "a.png", "b.png", "1,1,1", "1"], "1,1,1 1: expected fx,fy,cx,cy"),
-        (["{folder}", "a.png", "b.png", "1,1,1,1", "mm"], "1,1,1,1 mm: expected"),
-        (["{folder}", "a.png", "b.png", "1,1,1,1", "1"], "a.png: no image that OpenCV reads"),
+        (["nothing", "c.png", "d.png", "1,1,1,1", "1"], "nothing: no folder that export.py"),
+        (["pixels", "c.png", "d.png", "1,1,1,1", "1"], "pixels: its particles are pixels; pix"),
+        (["poses", "c.png", "d.png", "1,1,1", "1"], "1,1,1 1: expected fx,fy,cx,cy"),
+        (["poses", "c.png", "d.png", "1,1,1,1", "mm"], "1,1,1,1 mm: expected"),
+        (["poses", "c.png", "d.png", "1,1,1,1", "0"], "0: expected .* above 0"),
+        (["poses", "a.png", "d.png", "1,1,1,1", "1"], "a.png: no image that OpenCV reads"),
+        (["poses", "c.png", "c.png", "1,1,1,1", "1"], "c.png: has 3 channels, and depth has one"),
+        (["poses", "c.png", "0.png", "1,1,1,1", "1"], "0.png: no pixel has depth"),
+        (["poses", "c.png", "d.png", "1,1,1,1", "1"], "1: the median depth would be 700 m; is it"),
+        (["poses", "c.png", "d.png", "1,1,1,1", "1e5"], "1e5: the median depth would be 0.007 m"),
     ],
 )
 def test_the_examples_mistakes_are_one_line(
     typed: list[str], told: str, poses: ModuleType, tmp_path: Path, monkeypatch
 ) -> None:
-    (tmp_path / "filter.json").write_text("{}")
+    for name in ("poses", "pixels"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "filter.json").write_text(json.dumps({"particles_are": name}))
+    depth = np.full((6, 8), 700, np.uint16)
+    for name, image in (("c", np.zeros((6, 8, 3), np.uint8)), ("d", depth), ("0", 0 * depth)):
+        cv2.imwrite(str(tmp_path / f"{name}.png"), image)
     monkeypatch.chdir(tmp_path)
-    given = [one.format(folder=tmp_path) for one in typed]
-    monkeypatch.setattr("sys.argv", ["poses.py", *given])
-    with pytest.raises(SystemExit, match=told):
-        poses.read_arguments()
+    monkeypatch.setattr("sys.argv", ["poses.py", *typed])
+    with pytest.raises(SystemExit, match=f"^{told}"):
+        poses.read_arguments("poses")
 
 
 @pytest.mark.parametrize(
