@@ -14,7 +14,7 @@ import torch
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from rich.progress import Progress
 
-from posefilter.cli.console import ended, logging_for, say, typed
+from posefilter.cli.console import ended, logging_for, say, show_table, typed
 from posefilter.cli.progress_bar import Bars, Lines, briefly, format_metrics, progress
 from posefilter.progress import bars, watched
 
@@ -178,3 +178,8 @@ def test_words_and_hydras_own_log() -> None:
     )
     assert logging_for(["console=rich"]) == []
     assert len(logging_for(["model=x", "console=json"])) == 1
+
+
+def test_a_title_is_not_cut_where_its_table_is_narrower(capsys) -> None:
+    show_table("rich", "003_cracker_box", [("frames", "1"), ("lost", "0")])
+    assert capsys.readouterr().out.splitlines()[0].rstrip() == "003_cracker_box"

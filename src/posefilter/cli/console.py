@@ -59,7 +59,9 @@ def show_table(console: str, title: str, rows: Sequence[tuple[str, str]]) -> Non
     """Print a table of names and values; for machines, nothing."""
     if is_follower() or console == JSON:
         return
-    table = Table("", "", title=title, show_header=False, title_justify="left", title_style="bold")
+    # a title is cut where the table is narrower
+    table = Table("", "", title=title, show_header=False, min_width=len(title))
+    table.title_justify, table.title_style = "left", "bold"
     table.columns[1].justify = "right"
     for row in rows:
         table.add_row(*row)
