@@ -502,6 +502,7 @@ def test_mistakes_are_one_line(tmp_path: Path, capfd) -> None:
     cases = [
         ([str(bag)], ["color=/nothing"], "/rgb (sensor_msgs/msg/Image)"),
         ([str(bag)], ["color=/info"], "has type sensor_msgs/msg/CameraInfo"),
+        ([str(bag)], ["depth=/rgb"], "depth=/rgb: is the topic of color, too"),
         ([str(bag)], [], "within max_time_difference=0.01 s; the nearest is 0.05 s away"),
         ([str(bag)], ["on_error=maybe"], "choose raise or skip"),
         ([str(broken)], [], "it was cut off; `mcap recover` saves"),

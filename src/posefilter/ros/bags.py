@@ -114,6 +114,8 @@ class BagReader:
                 )
             if kinds[topic] not in fits:
                 raise UserError(f"{key}={topic}: has type {kinds[topic]}, not {' or '.join(fits)}")
+        if self.topics.color == self.topics.depth:
+            raise UserError(f"depth={self.topics.depth}: is the topic of color, too; name another")
 
     @property
     def images(self) -> int:
