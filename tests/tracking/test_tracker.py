@@ -1,6 +1,8 @@
 """The tracker on a likelihood that is made by hand: it follows, notices a loss, and recovers."""
 
 import dataclasses
+import math
+from typing import Any
 
 import numpy as np
 import pytest
@@ -419,11 +421,15 @@ def test_several_objects_give_a_list_and_the_seed_decides() -> None:
         ({"lost_below": 0.9}, "found_above=0.5 must lie in"),
         ({"window_scale": 0.5}, "window_scale 1 or more"),
         ({"kld_quantile": 1.0}, "kld_quantile between 0 and 1"),
+        ({"jump_penalty": math.nan}, "jump_penalty=nan must be a finite number"),
+        ({"lost_below": "0.2"}, "lost_below=0.2 must be a finite number"),
+        ({"follow": None}, "follow=None must be of FilterSettings"),
+        ({"motion": 5.0}, "motion=5.0 must be of ConstantVelocity"),
     ],
 )
-def test_impossible_settings_are_refused(wrong: dict[str, float], told: str) -> None:
+def test_impossible_settings_are_refused(wrong: dict[str, Any], told: str) -> None:
     with pytest.raises(UserError, match=told):
-        TrackerSettings(**wrong)  # type: ignore[arg-type]
+        TrackerSettings(**wrong)
 
 
 def test_impossible_filters_and_methods_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -432,6 +438,10 @@ def test_impossible_filters_and_methods_are_refused(monkeypatch: pytest.MonkeyPa
         dataclasses.replace(follow, min_particles=10, max_particles=5)
     with pytest.raises(UserError, match="noise levels fall"):
         FilterSettings(10, 20, 0, 2, 0.001, 0.004, 64)
+    with pytest.raises(UserError, match="initial_sigma=None must be a finite number"):
+        dataclasses.replace(follow, initial_sigma=None)
+    with pytest.raises(UserError, match="velocity_gain=a: must lie between 0 and 1"):
+        ConstantVelocity(velocity_gain="a")  # type: ignore[arg-type]
     toy, estimator = make_toy()
     monkeypatch.setattr(type(toy), "provides", ("pose", "pose_space", "score_poses", "objectness"))
     toy.__dict__.pop("capabilities", None)

@@ -59,9 +59,9 @@ class ConstantVelocity:
     ) -> None:
         shift = _three(translation_mm, "translation_mm")
         turn = _three(rotation_deg, "rotation_deg")
-        if not 0 <= velocity_gain <= 1:
+        if not (isinstance(velocity_gain, int | float) and 0 <= velocity_gain <= 1):
             raise UserError(f"motion.velocity_gain={velocity_gain}: must lie between 0 and 1")
-        if not 1 <= max_noise_scale < math.inf:
+        if not (isinstance(max_noise_scale, int | float) and 1 <= max_noise_scale < math.inf):
             raise UserError(
                 f"motion.max_noise_scale={max_noise_scale}: must be a number, 1 or more"
             )

@@ -1,9 +1,23 @@
 """What a tracker is set to."""
 
-from dataclasses import dataclass, field
+import math
+from dataclasses import dataclass, field, fields
+from numbers import Real
+from typing import Any, cast
 
 from posefilter.errors import UserError
 from posefilter.tracking.motion import ConstantVelocity
+
+
+def check_types(settings: Any) -> None:
+    """Raise UserError where a setting is no finite number, or of another class."""
+    for one in fields(settings):
+        value, kind = getattr(settings, one.name), cast(type, one.type)
+        if kind not in (int, float):
+            if not isinstance(value, kind):
+                raise UserError(f"tracker: {one.name}={value} must be of {kind.__name__}")
+        elif not (isinstance(value, Real) and math.isfinite(value)):
+            raise UserError(f"tracker: {one.name}={value} must be a finite number")
 
 
 def check_whole(settings: object, **minimums: int) -> None:
@@ -42,6 +56,7 @@ class FilterSettings:
 
     def __post_init__(self) -> None:
         """Check the numbers."""
+        check_types(self)
         check_whole(self, min_particles=1, max_particles=1, proposals=0, steps=1, pixels=1)
         if self.max_particles < self.min_particles:
             raise UserError(
@@ -123,6 +138,7 @@ class TrackerSettings:
 
     def __post_init__(self) -> None:
         """Check the numbers."""
+        check_types(self)
         check_whole(self, quadratic_fits=0, fit_pixels=1, patience=1, probe_every=1)
         check_whole(self, whole_image_every=0, window_side=64, search_every=0, texture_every=0)
         least = min(self.noise_scale, self.smoothing_noise, self.jump_penalty, self.icp_prior)
