@@ -283,7 +283,7 @@ class Result:
             torch.from_numpy(self.pose),
             torch.tensor(self.score),
         )
-        return draw_belief(rgb, intrinsics, tensors, self.object_model)
+        return draw_belief(rgb, intrinsics, tensors, self.object_model, draws=self.belief.draws)
 
     def draw_band(
         self, rgb: Any, intrinsics: Any, shape: "Shape | None" = None, level: float = 0.95

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 
+from posefilter.belief import Belief
 from posefilter.figures.belief import (
     Mark,
     draw_belief,
@@ -271,6 +272,25 @@ def test_an_equivalent_pose_is_no_second_one() -> None:
     assert found.second is None
     assert found.share == pytest.approx(1)
     assert found.rotation < 0.01
+
+
+def test_the_draws_of_a_calibrated_belief_are_one_mode_however_far_apart() -> None:
+    """The picture then has the modes of `Belief.modes`, and the width of all draws."""
+    best, center = looking(0.3, 0.4), model().center.double()
+    noise = torch.randn(200, 6, generator=torch.Generator().manual_seed(3)).double()
+    scale = torch.tensor([0.03] * 3 + [0.4] * 3).double()
+    scale = torch.where(torch.arange(200)[:, None] < 150, scale, 0.05 * scale)
+    start = torch.where((torch.arange(200) < 150)[:, None, None], best, looking(-1.4, -0.5))
+    poses, weights = move_about(start, scale * noise, center), torch.full((200,), 1 / 200).double()
+    assert summarize_belief(poses, weights, best, model()).share < 0.7
+    found = summarize_belief(poses, weights, best, model(), draws=150)
+    belief = Belief(poses.numpy(), weights.numpy(), center.numpy(), 0.136, 0.27, draws=150)
+    assert [mode.mass for mode in belief.modes[:1]] == pytest.approx([found.share])
+    assert found.second is not None
+    assert found.second.weight == pytest.approx(belief.modes[1].mass)
+    assert found.share == pytest.approx(0.75)
+    assert found.translation == pytest.approx(0.03 * math.sqrt(3), rel=0.1)
+    assert found.rotation == pytest.approx(0.4 * math.sqrt(3), rel=0.1)
 
 
 def test_a_single_pose_and_a_lost_estimate_are_reported() -> None:

@@ -94,7 +94,7 @@ def test_a_calibrated_belief_is_shown_where_its_own_poses_are() -> None:
         poses=trace.belief.poses[:, :5], log_weights=torch.full((2, 5), 0.2).log()
     )
     given = (trace._replace(belief=few), two_images(), box(), PixelSpace(), box().hull)
-    last = collect_view_data(*given, image=1, calibrated=True).moments[-1]
+    last = collect_view_data(*given, image=1, draws=0).moments[-1]
     ahead = last.centers @ two_images().intrinsics[1].double().numpy().T
     assert last.pixels.shape == (5, 2)
     assert np.allclose(last.pixels, ahead[:, :2] / ahead[:, 2:])

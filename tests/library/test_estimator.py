@@ -5,6 +5,7 @@ import os
 import re
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -285,7 +286,10 @@ def test_pictures(small: posefilter.Estimator) -> None:
     drawn = result.draw_overlay(rgb, K)
     assert drawn.dtype == np.uint8
     assert drawn.shape[1] >= rgb.shape[1]
-    assert len(np.unique(result.draw_belief(rgb, K).reshape(-1, 3), axis=0)) > 100
+    picture = result.draw_belief(rgb, K)
+    assert len(np.unique(picture.reshape(-1, 3), axis=0)) > 100
+    calibrated = replace(result, belief=replace(result.belief, draws=len(result.belief.weights)))
+    assert not np.array_equal(calibrated.draw_belief(rgb, K), picture)  # its draws are one mode
     band = result.draw_band(rgb, K, level=0.5)
     assert band.shape[1] == drawn.shape[1]
     assert len(np.unique(band.reshape(-1, 3), axis=0)) > 100

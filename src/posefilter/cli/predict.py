@@ -99,8 +99,8 @@ def predict_one(job: Job) -> list[Result]:
     write_json(folder / "pose.json", answer)
     if cfg.save_rerun:
         model, space = method.object_model, method.space
-        known = run.draws is not None
-        view = collect_view_data(run.trace, run.batch, model, space, shape, calibrated=known)
+        draws = None if run.draws is None else int(run.draws[0])
+        view = collect_view_data(run.trace, run.batch, model, space, shape, draws=draws)
         record(view, folder / VIEW)
     if cfg.console != JSON:
         print_result(result)

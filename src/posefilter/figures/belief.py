@@ -59,6 +59,7 @@ def draw_belief(
     truth: Any = None,
     title: str = "",
     axis: int | None = None,
+    draws: int = 0,
 ) -> np.ndarray:
     """Draw the belief of one image: its rotations on a map, its centers on the photograph, and six
     marginals.
@@ -66,14 +67,15 @@ def draw_belief(
     rgb: one image in any form that `Estimator.predict` takes; intrinsics (3, 3) [px]; belief: a
     result's, whose heaviest mode is then the estimate, or a filter's tensors of one image, with
     their leading dimension of 1 or without; truth (4, 4); axis: the object's axis on the map (its
-    longest, if None). Raises UserError where one is not as it should be.
+    longest, if None); draws: so many of the tensors' first poses are a calibrated belief's draws
+    about the estimate. Raises UserError where one is not as it should be.
     """
     rgb, K = to_picture(rgb), to_camera(intrinsics)
     poses, weights, best = select_single(belief)
     true = None if truth is None else torch.from_numpy(to_pose(truth))
     axis = find_longest_axis(object_model) if axis is None else axis
     ess = float(1 / weights.square().sum())
-    summary = summarize_belief(poses, weights, best, object_model)
+    summary = summarize_belief(poses, weights, best, object_model, draws)
     sure, other = describe_belief(summary)
     marks = [Mark(best, ESTIMATE, "square"), *([] if true is None else [Mark(true, TRUTH, "ring")])]
     entries = [("estimate", ESTIMATE), *([] if true is None else [("truth", TRUTH)])]

@@ -27,7 +27,7 @@ class BeliefSummary(NamedTuple):
 
 
 def summarize_belief(
-    poses: Tensor, weights: Tensor, best: Tensor, object_model: ObjectModel
+    poses: Tensor, weights: Tensor, best: Tensor, object_model: ObjectModel, draws: int = 0
 ) -> BeliefSummary:
     """Return how sure a belief is; poses that a symmetry makes of one another are one.
 
@@ -36,9 +36,10 @@ def summarize_belief(
         weights: Their weights (N,), summing to 1.
         best: The estimate (4, 4).
         object_model: The object.
+        draws: So many of the first particles are a calibrated belief's draws about the estimate.
     """
     center = object_model.center.detach().cpu().double()
-    found = find_hypotheses(poses, weights.log(), best, object_model)
+    found = find_hypotheses(poses, weights.log(), best, object_model, draws)
     space = PoseSpace((*center.tolist(),), object_model.radius)
     members = found.own if bool(found.own.any()) else torch.ones_like(found.own)
     own = torch.where(members, weights, 0.0)

@@ -79,7 +79,7 @@ def collect_view_data(
     space: Space,
     shape: Shape,
     image: int = 0,
-    calibrated: bool = False,
+    draws: int | None = None,
 ) -> ViewData:
     """Gather what is shown of one of a trace's images.
 
@@ -90,8 +90,8 @@ def collect_view_data(
         space: Of the particles.
         shape: The object's mesh, or the vertices of its hull [m].
         image: Which of the images.
-        calibrated: Whether the trace's belief is calibrated, so that its poses are not those of the
-            last particles.
+        draws: How many of the first poses of the trace's belief are draws about the estimate; None:
+            it is not calibrated, and its poses are those of the last particles.
     """
     K = batch.intrinsics[image].detach().cpu().double()
     center = object_model.center.detach().cpu().double()
@@ -99,7 +99,7 @@ def collect_view_data(
     belief = trace.belief
     poses, best = (x[image].detach().cpu().double() for x in (belief.poses, belief.best))
     estimate, others, left_out, *_ = find_hypotheses(
-        poses, belief.log_weights[image].detach().cpu(), best, object_model
+        poses, belief.log_weights[image].detach().cpu(), best, object_model, draws or 0
     )
     unit = 1000.0 if isinstance(space, PoseSpace) else 1.0
     moments = []
@@ -109,7 +109,7 @@ def collect_view_data(
         moments.append(
             make_moment(output.pose[image], particles.log_weights[image], pixels, center, K, sigma)
         )
-    at_centers = calibrated or isinstance(space, PoseSpace)
+    at_centers = draws is not None or isinstance(space, PoseSpace)
     last = None if at_centers else trace.particles[-1].state[image]
     moments.append(
         make_moment(belief.poses[image], belief.log_weights[image], last, center, K, None)
@@ -179,28 +179,36 @@ class Hypotheses(NamedTuple):
 
 
 def find_hypotheses(
-    poses: Tensor, log_weights: Tensor, best: Tensor, object_model: ObjectModel
+    poses: Tensor, log_weights: Tensor, best: Tensor, object_model: ObjectModel, draws: int = 0
 ) -> Hypotheses:
     """Return the estimate, the belief's other modes, and the weight in modes too light to be shown.
 
     The estimate stands for the mode of the particle nearest to it, and has that one's weight; where
     no particle is within a tenth of the diameter (a refinement led away from them all) it has none.
+    The draws of a calibrated belief are its mode, however far apart.
     Poses that a symmetry makes of one another are one.
-    (N, 4, 4), (N,), (4, 4).
+    (N, 4, 4), (N,), (4, 4); draws: so many of the first poses are draws about the estimate.
     """
     center, group = (x.detach().to(poses) for x in (object_model.center, object_model.symmetries))
     poses = gather_copies(poses, best, center, object_model.radius, densify(group))
     space = PoseSpace((*object_model.center.tolist(),), object_model.radius)
-    modes = find_pose_modes(poses, log_weights, space, object_model.diameter)
-    distance, nearest = space.distance(poses, best).min(0)
-    own = int(modes.member[nearest]) if float(distance) <= APART * object_model.diameter else None
-    rest = [i for i in range(len(modes.weights)) if i != own]
-    shown = [i for i in rest if float(modes.weights[i]) >= _LEAST][:_MOST]
-    others = tuple(Hypothesis(modes.states[i].numpy(), float(modes.weights[i])) for i in shown)
-    estimate = Hypothesis(best.numpy(), 0.0 if own is None else float(modes.weights[own]))
-    left_out = float(sum(modes.weights[i] for i in rest if i not in shown))
-    members = torch.zeros(len(poses), dtype=torch.bool) if own is None else modes.member == own
-    return Hypotheses(estimate, others, left_out, members, poses)
+    weights = torch.softmax(log_weights.double(), 0)
+    members, left = torch.arange(len(poses)) < draws, float(weights[draws:].sum())
+    found: list[Hypothesis] = []
+    if left > 0:
+        modes = find_pose_modes(poses[draws:], log_weights[draws:], space, object_model.diameter)
+        pairs = zip(modes.states, modes.weights, strict=True)
+        found = [Hypothesis(pose.numpy(), left * float(mass)) for pose, mass in pairs]
+        if not draws:
+            distance, nearest = space.distance(poses, best).min(0)
+            if float(distance) <= APART * object_model.diameter:
+                own = int(modes.member[nearest])
+                members = modes.member == own
+                found.pop(own)
+    others = tuple([one for one in found if one.weight >= _LEAST][:_MOST])
+    estimate = Hypothesis(best.numpy(), float(weights[members].sum()))
+    left_out = sum(one.weight for one in found) - sum(one.weight for one in others)
+    return Hypotheses(estimate, others, max(0.0, left_out), members, poses)
 
 
 def make_mesh(shape: Shape, name: str) -> Mesh:
