@@ -135,6 +135,8 @@ def test_images_that_cannot_be_resampled_are_refused() -> None:
                 undistort(rgb, depth, *matrices)
     with pytest.raises(UserError, match="but rgb"):
         undistort(rgb, depth[:3], K, BROWN)
+    with pytest.raises(UserError, match="expected one image"):
+        undistort(rgb[None], depth[None], K, BROWN)
     with pytest.raises(UserError, match="float16"):
         undistort(rgb, depth.astype(np.float16), K, BROWN)
 

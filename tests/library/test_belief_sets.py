@@ -208,7 +208,12 @@ def test_poses_of_three_rows_are_taken_and_what_is_no_pose_is_refused() -> None:
 
 def test_a_file_is_found_by_the_name_that_it_was_saved_by(tmp_path: Path) -> None:
     samples = np.tile(np.eye(4), (5, 1, 1))
-    Belief(samples, np.full(5, 0.2), np.zeros(3), 0.1, 0.2, "duck").save(tmp_path / "belief")
+    belief = Belief(samples, np.full(5, 0.2), np.zeros(3), 0.1, 0.2, "duck")
+    belief.save(tmp_path / "belief")
+    (tmp_path / "folder").mkdir()
+    with pytest.raises(UserError, match=r"folder: is a folder; name the file to write$"):
+        belief.save(tmp_path / "folder")
+    assert not (tmp_path / "folder.npz").exists()
     assert (tmp_path / "belief.npz").is_file()
     for name in ("belief", "belief.npz"):
         assert Belief.load(tmp_path / name).object == "duck"

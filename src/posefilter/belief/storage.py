@@ -17,6 +17,8 @@ def write_arrays(path: str | Path, poses: np.ndarray, weights: np.ndarray, **oth
     Raises:
         UserError: The file cannot be written.
     """
+    if Path(path).is_dir():  # the file would be beside it
+        raise UserError(f"{path}: is a folder; name the file to write")
     file = _with_suffix(path)
     poses, weights = poses.astype(np.float32), weights.astype(np.float32)
     with open_whole(file, sync=False) as stream:

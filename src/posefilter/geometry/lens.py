@@ -51,6 +51,8 @@ def undistort(
     height, width = depth.shape[:2]
     if rgb.shape[:2] != (height, width):
         raise UserError(f"depth: has shape {depth.shape}, but rgb {rgb.shape}")
+    if rgb.ndim > 3:
+        raise UserError(f"rgb: has shape {rgb.shape}; expected one image (H, W, 3)")
     K, wanted = (
         tuple(check_camera_matrix(one).ravel().tolist())
         for one in (intrinsics, intrinsics if new_intrinsics is None else new_intrinsics)
