@@ -179,6 +179,19 @@ def test_a_number_alone_makes_no_process_of_several(
     assert is_follower.__wrapped__() is follower
 
 
+def test_a_command_that_is_no_training_works_in_the_first_of_several_processes_alone(
+    monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    typed = ["predict", "checkpoint=none.ckpt", "rgb=a.png", "depth=a.png", "intrinsics=1,1,1,1"]
+    assert main(typed) == MISTAKE
+    assert "none.ckpt" in capfd.readouterr().err
+    monkeypatch.setattr("posefilter.cli.command.is_follower", lambda: True)
+    assert main(typed) == MISTAKE
+    told = capfd.readouterr().err
+    assert told.startswith("predict: this is one of several processes")
+    assert len(told.splitlines()) == 1
+
+
 def test_a_job_of_wandb_ends_with_its_job(monkeypatch: pytest.MonkeyPatch) -> None:
     finished: list[bool] = []
     wandb = SimpleNamespace(run=None, finish=lambda: finished.append(True))

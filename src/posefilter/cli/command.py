@@ -39,7 +39,7 @@ from posefilter.cli.fit import check_fit
 from posefilter.cli.job import Job, first, plain_name, run_of
 from posefilter.cli.main import COMMANDS, describe_version
 from posefilter.cli.plain import to_plain
-from posefilter.cli.ranks import STARTED
+from posefilter.cli.ranks import STARTED, is_follower
 from posefilter.cli.replaced import replace_typed
 from posefilter.cli.resume import keep_record, with_resumed
 from posefilter.cli.running import EXPECTED, import_plugin, run_job
@@ -62,6 +62,7 @@ from posefilter.paths import find_conf
 from posefilter.ranges import check_ranges
 from posefilter.signals import stopped_by_sigterm
 
+_IN_PROCESSES = ("train", "onboard")  # commands that can be several processes of one training
 _FAILED = (FloatingPointError, ProblemsFound, NotThere)  # nothing is wrong with the command line
 
 
@@ -98,6 +99,11 @@ def run_command(name: str, home: Path | None = None, arguments: list[str] | None
         if "--version" in arguments:  # Hydra's own
             print(describe_version())
             return 0
+        if is_follower() and name not in _IN_PROCESSES:
+            raise UserError(
+                "this is one of several processes that srun or torchrun has started, and the first "
+                "does all of the work; start one (srun --ntasks=1)"
+            )
         arguments = without_trace(arguments, name)
         arguments = without_deletion(arguments)
         check_choices(arguments, conf, name)
