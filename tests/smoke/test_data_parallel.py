@@ -5,6 +5,7 @@ import os
 import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import pytest
@@ -64,17 +65,18 @@ def test_two_processes_agree_on_when_to_write_what_a_run_goes_on_from(
 def test_two_processes_stop_together(tmp_path: Path, tiny_scenes: Path) -> None:
     """A signal reaches them at different steps; the run is left where it can be gone on with."""
     out = tmp_path / "run"
-    words, clean = command(tiny_scenes, out, 4000)
+    last = out / "checkpoints" / "last.ckpt"
+    words, clean = command(tiny_scenes, out, 4000, "callbacks.last.minutes=0.012")
     with subprocess.Popen(
         words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=tmp_path,
         env=clean, start_new_session=True,
     ) as process:  # fmt: skip
-        assert process.stdout is not None
-        for line in process.stdout:
-            if '"training"' in line:
-                break
+        while not last.is_file() and process.poll() is None:  # both train
+            time.sleep(0.05)
         os.killpg(process.pid, signal.SIGINT)  # as a terminal's Ctrl-C does
-        _, err = process.communicate(timeout=120)
+        told, err = process.communicate(timeout=120)
     assert process.returncode == 130, err
     assert "Traceback" not in err
-    assert torch.load(out / "checkpoints" / "last.ckpt", weights_only=True)["global_step"] > 0
+    stopped = json.loads(told.splitlines()[-1])
+    assert stopped["event"] == "stopped"
+    assert torch.load(last, weights_only=True)["global_step"] == stopped["step"] > 0
