@@ -317,6 +317,8 @@ class Belief:
     ) -> Projection:
         """Return where the belief puts points of the object in an image, and how surely.
 
+        Points behind the camera, which no image shows, have places that mean nothing.
+
         Args:
             intrinsics: Camera matrix (3, 3) [px].
             points: (P, 3), or one (3,), in the object's frame [m]; None: its center.

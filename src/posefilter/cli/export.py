@@ -38,7 +38,8 @@ def export(job: Job) -> None:
     before = recipe["settings"]
     recipe["settings"] = changed(before, changes(job.cfg))
     if not is_calibrated_filter(recipe["settings"], before) and stripped.pop("calibration", None):
-        sentence = "the calibration is left out: it was made for another filter (calibrate.py)"
+        reason = "it was made for another filter (calibrate.py)"
+        sentence = f"warning: the calibration is left out: {reason}"
         say(job.cfg.console, "warning", sentence, calibration="left out")
     recipe["choices"] = {**recipe["choices"], **chosen(job)}
     size = write_weights(stripped, out, job.cfg.max_mb)
