@@ -2,6 +2,7 @@
 should be read.
 """
 
+import math
 import re
 from pathlib import Path
 
@@ -27,6 +28,9 @@ def test_keys_are_unique_and_labels_tell_metrics_of_a_table_apart() -> None:
 def test_a_number_is_written_in_its_unit() -> None:
     assert find_metric("particles_on_object").describe(0.5) == "50.0 %"
     assert find_metric("belief/spread_m").describe(0.0123) == "12.3 mm"
+    assert find_metric("belief/spread_m").describe(1.0412) == "1.04 m"
+    assert find_metric("belief/spread_m").split(0.9999) == ("999.9", "mm")
+    assert find_metric("belief/spread_m").describe(math.inf) == "inf mm"
     assert find_metric("add/median_mm").title == "median ADD [mm]"
     assert find_metric("iou").describe(0.8766) == "0.877"
     assert find_metric("diagnostics/on_object/first").column == "on object at start %"

@@ -61,9 +61,18 @@ class MetricInfo(NamedTuple):
         """Return a stored number as it is written, without its unit."""
         return format(self.convert(value), self.form)
 
+    def split(self, value: float) -> tuple[str, str]:
+        """Return a stored number as it is written, and its unit: meters where millimeters get
+        long.
+        """
+        shown = self.convert(value)
+        if self.unit == "mm" and 1000 <= abs(shown) < math.inf:
+            return f"{shown / 1000:.2f}", "m"
+        return self.format(value), self.unit
+
     def describe(self, value: float) -> str:
         """Return a stored number as it is written, with its unit: `94.7 %`."""
-        return f"{self.format(value)} {self.unit}".strip()
+        return " ".join(self.split(value)).strip()
 
 
 def _share(

@@ -96,7 +96,7 @@ def make_tiles(run: Run) -> list[Tile]:
     """Return a run's main numbers."""
     known = collect_numbers(run)
     infos = [find_metric(key) for key in HEADLINE if key in known]
-    return [Tile(info.format(known[info.key]), info.unit, info.label) for info in infos]
+    return [Tile(*info.split(known[info.key]), info.label) for info in infos]
 
 
 def list_diagnostics(run: Run) -> list[Block]:
