@@ -306,6 +306,8 @@ def test_a_setting_that_nothing_reads_cannot_be_added() -> None:
         check_added(["debug=smoke", "++foo=1"], conf, "train")
     with pytest.raises(UserError, match=r"\+foo: nothing reads"):
         compose_config("train", ["+foo=1"])
+    with pytest.raises(UserError, match=r"\+fliter.particles: nothing reads"):
+        check_added(["++fliter.particles=9"], conf, "train")
     for taken in ("+experiment=memorize", "++seed=1", "+filter.own=1", "+plugins=[own]"):
         check_added([taken], conf, "train")
 

@@ -10,6 +10,7 @@ from pathlib import Path
 import yaml
 
 from posefilter.cli.instantiate import hint
+from posefilter.cli.plain import key_of
 from posefilter.cli.renamed import rename
 from posefilter.cli.trust import find_folders, named, trusted
 from posefilter.errors import UserError
@@ -50,8 +51,8 @@ def check_choices(arguments: list[str], conf: Path, command: str | None = None) 
 def check_added(
     typed: Sequence[str], conf: Path, command: str, arguments: Sequence[str] = ()
 ) -> None:
-    """Raise UserError where a setting is added at the top that nothing would read: neither the
-    command, nor an interpolation, nor is it a group.
+    """Raise UserError where a setting is added that nothing would read: its first name is known
+    neither to the command nor to an interpolation, nor is it a group.
 
     Args:
         typed: What is typed.
@@ -59,7 +60,7 @@ def check_added(
         command: The command's name.
         arguments: All that the command is given, the settings of a resumed run too.
     """
-    added = [one.partition("=")[0].lstrip("+") for one in typed if re.match(r"\+{1,2}\w+=", one)]
+    added = [key_of(one) for one in typed if re.match(r"\+{1,2}[\w.]+=", one)]
     if not added:
         return
     folders = [conf, *choice_folders(typed)]
@@ -69,8 +70,9 @@ def check_added(
     files = (file for folder in folders for file in folder.glob("*/**/*.yaml"))
     text = "\n".join([*typed, *arguments, *(file.read_text(encoding="utf-8") for file in files)])
     for key in added:
-        is_referred_to = re.search(rf"\$\{{(oc\.select:)?{key}[.,}}]", text)
-        if not (key in {*settings, *chosen, *groups} or is_referred_to):
+        top = key.partition(".")[0]
+        is_referred_to = re.search(rf"\$\{{(oc\.select:)?{top}[.,}}]", text)
+        if not (top in {*settings, *chosen, *groups, "hydra"} or is_referred_to):
             raise UserError(
                 f"+{key}: nothing reads a setting of this name; typed without + it is looked for "
                 "among those that there are"
