@@ -80,6 +80,18 @@ def read_text(path: Path, max_bytes: int = MOST_BYTES) -> str:
         raise BadData(path, "not a text in UTF-8", str(error)) from error
 
 
+def open_text(path: Path) -> io.StringIO:
+    """Return a text file as a stream, with the ends of its lines as they are, as `csv` needs it.
+
+    Args:
+        path: The file.
+
+    Raises:
+        BadData: As `read_text`.
+    """
+    return io.StringIO(read_text(path), newline="")
+
+
 def read_json(
     path: Path, max_bytes: int = MOST_BYTES, parse: Callable[[bytes], Any] = json.loads
 ) -> Any:

@@ -1,13 +1,12 @@
 """Read the points that a dataset defines ADD on."""
 
-import io
 from pathlib import Path
 
 import numpy as np
 
 from posefilter.errors import UserError
 from posefilter.geometry.rigid import move
-from posefilter.limits import read_text
+from posefilter.limits import open_text
 from posefilter.paths import is_plain_name
 
 
@@ -31,7 +30,7 @@ def read_model_points(
             raise UserError(f"{folder}: no {name}/points.xyz here (data.model_points_dir)")
         return None
     try:
-        native = np.loadtxt(io.StringIO(read_text(path)), dtype=np.float64, ndmin=2)
+        native = np.loadtxt(open_text(path), dtype=np.float64, ndmin=2)
     except ValueError as error:
         raise UserError(f"{path}: not rows of three numbers ({error})") from error
     if native.shape[1] != 3 or len(native) < 4 or not np.isfinite(native).all():

@@ -3,7 +3,6 @@ estimate (<https://bop.felk.cvut.cz/challenges>, "Formats").
 """
 
 import csv
-import io
 import math
 from collections.abc import Sequence
 from decimal import Decimal, InvalidOperation
@@ -14,7 +13,7 @@ import numpy as np
 
 from posefilter.errors import UserError
 from posefilter.files import open_whole_text
-from posefilter.limits import read_text
+from posefilter.limits import open_text
 
 _NEAREST = 0.02  # [m] median distance of objects
 HEADER = ("scene_id", "im_id", "obj_id", "score", "R", "t", "time")
@@ -84,7 +83,7 @@ def read_poses_csv(path: Path) -> list[PoseRow]:
     if not path.is_file():
         raise UserError(f"estimates={path}: no such file")
     rows = []
-    table = csv.reader(io.StringIO(read_text(path), newline=""))
+    table = csv.reader(open_text(path))
     try:
         for number, cells in enumerate(table, start=1):
             first = cells[0].strip().lstrip("\ufeff").lower() if cells else ""

@@ -1,7 +1,6 @@
 """Errors of each image of a test, as a CSV table."""
 
 import csv
-import io
 import math
 from collections.abc import Sequence
 from pathlib import Path
@@ -11,7 +10,7 @@ import torch
 
 from posefilter.files import open_whole_text
 from posefilter.forms import MOST
-from posefilter.limits import read_text
+from posefilter.limits import open_text
 from posefilter.metrics.scores import summarize_rows
 
 FILE = "errors.csv"
@@ -54,8 +53,7 @@ def read_errors(path: Path) -> list[ImageError]:
         BadData: It is larger than such a file can be, or no text.
     """
     try:
-        table = io.StringIO(read_text(path), newline="")
-        return [parse_row(row) for row in csv.DictReader(table)]
+        return [parse_row(row) for row in csv.DictReader(open_text(path))]
     except csv.Error as error:
         raise ValueError(str(error)) from error
 

@@ -3,7 +3,6 @@ the seed as one.
 """
 
 import csv
-import io
 import math
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
@@ -14,7 +13,7 @@ from typing import NamedTuple
 
 from posefilter.errors import UserError
 from posefilter.forms import MOST
-from posefilter.limits import read_text
+from posefilter.limits import open_text
 from posefilter.metrics.scores import overall
 from posefilter.report.diagnostics import list_numbers
 from posefilter.report.gather import SWEEP_MARKS, read_json, read_part, read_texts, read_yaml
@@ -129,7 +128,7 @@ def read_jobs(folder: Path, found: Sequence[Path]) -> tuple[list[str], list[Job]
 def read_jobs_from_csv(path: Path) -> tuple[list[str], list[Job]]:
     """Return the same of a summary: columns of no known figure are axes."""
     try:
-        rows = list(csv.DictReader(io.StringIO(read_text(path), newline=""), restval=""))
+        rows = list(csv.DictReader(open_text(path), restval=""))
     except (csv.Error, ValueError) as error:
         raise UserError(f"{path}: is no table of runs ({error})") from error
     others = (*COLUMNS, "folder", "error")
