@@ -169,8 +169,8 @@ def _collect(values: Iterable[Any], into: list[Any]) -> None:
 
 
 def _map(value: Any, change: Callable[[Any], Any]) -> Any:
-    if isinstance(value, Tensor | torch.Size):
-        return change(value) if isinstance(value, Tensor) else value
+    if isinstance(value, torch.Size):
+        return value
     if isinstance(value, dict):
         return {key: _map(one, change) for key, one in value.items()}
     if isinstance(value, list | tuple):
@@ -202,12 +202,7 @@ def _find_device(
 def _check_devices(name: str, tensors: list[Tensor]) -> None:
     if name in _BY_INDEX and isinstance(tensors[0], Marked):
         tensors = [one for one in tensors if one.dtype not in (torch.int64, torch.bool)]
-    marked = [isinstance(one, Marked) for one in tensors]
-    if (
-        any(marked)
-        and not all(marked)
-        and len({m for m, one in zip(marked, tensors, strict=True) if one.dim() > 0}) > 1
-    ):
+    if len({isinstance(one, Marked) for one in tensors if one.dim() > 0}) > 1:
         raise RuntimeError(
             f"{name}: Expected all tensors to be on the same device, but found cuda:0 and cpu"
         )
