@@ -40,6 +40,7 @@ ROW = ImageError(
     0.8,
     12.5,
     0.25,
+    1.0,
 )
 
 
@@ -65,7 +66,7 @@ def test_rows_are_read_as_they_were_written(tmp_path: Path) -> None:
     older = [line.rsplit(",", 4)[0] for line in (tmp_path / FILE).read_text().splitlines()]
     (tmp_path / FILE).write_text("\n".join(older) + "\n")  # as before there were probabilities
     read = read_errors(tmp_path / FILE)
-    assert [row[:-4] for row in read] == [row[:-4] for row in rows]
+    assert [row[:-5] for row in read] == [row[:-5] for row in rows]
     assert all(math.isnan(row.probability) for row in read)
     (tmp_path / FILE).write_text((tmp_path / FILE).read_text().replace("add_mm", "other", 1))
     with pytest.raises(ValueError, match="add_mm is missing"):
@@ -77,7 +78,7 @@ def test_errors_of_a_batch_are_in_its_order() -> None:
     errors = PoseErrors([object_model(0.2), object_model(0.4)])
     guess = shifted([0.01, float("nan"), 0.03, 0.02])
     errors.update(guess, shifted([0.0] * 4), torch.tensor([1, 0, 0, 1]))
-    add, _, diameter = errors.rows[-1].T.tolist()
+    add, _, diameter, _ = errors.rows[-1].T.tolist()
     assert add == pytest.approx([0.01, math.inf, 0.03, 0.02], abs=1e-6)
     assert diameter == pytest.approx([0.4, 0.2, 0.2, 0.4])
 
@@ -99,7 +100,9 @@ def tested(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[Path, PoseE
     monkeypatch.setattr(
         "posefilter.callbacks.errors.find_shape", lambda trainer, method: method.object_model.hull
     )
-    errors = PoseErrors([object_model()])
+    half_turn = torch.diag(torch.tensor([-1.0, -1.0, 1.0, 1.0]))
+    symmetric = object_model()._replace(symmetries=torch.stack([torch.eye(4), half_turn]))
+    errors = PoseErrors([symmetric])
     records = [
         FrameRecord(f"scene_{i // 2}/{i:06d}", f"scene_{i // 2}", i // 2, i, 1, "box", 0, ())
         for i in range(6)
@@ -142,7 +145,7 @@ def test_metrics_come_out_of_the_rows_again(tested: tuple[Path, PoseErrors]) -> 
     assert rows[3].image == "scene_1/000003"
     assert [row.visibility for row in rows] == [0.25, 0.5, 1.0] * 2
     expected = errors.compute()
-    for name in ("add", "add_s"):
+    for name in ("add", "add_s", "add_up_to_symmetry"):
         own = torch.tensor([getattr(row, f"{name}_mm") for row in rows], dtype=torch.float64) / 1000
         diameter = torch.tensor([row.diameter_mm for row in rows], dtype=torch.float64) / 1000
         assert summarize(own, diameter) == pytest.approx(expected[name], rel=1e-12)

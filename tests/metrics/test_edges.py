@@ -10,6 +10,7 @@ from tests.models.toy import scenes, square
 
 from posefilter.errors import UserError
 from posefilter.geometry.pose import make_pose, transform
+from posefilter.geometry.rotation import exp_so3
 from posefilter.geometry.spaces import PoseSpace
 from posefilter.geometry.symmetries import densify
 from posefilter.meshes.symmetries import symmetry_group
@@ -234,19 +235,54 @@ def test_add_up_to_symmetry_is_the_least_of_all() -> None:
     torch.testing.assert_close(found, torch.zeros(2), atol=1e-6, rtol=0)
 
 
+def test_of_many_symmetries_add_is_still_the_least() -> None:
+    draw = torch.Generator().manual_seed(0)
+    points = 0.1 * torch.randn(700, 3, generator=draw, dtype=torch.float64)
+    around = torch.eye(4, dtype=torch.float64).repeat(40, 1, 1)
+    around[:, :3, :3] = exp_so3(
+        torch.arange(40)[:, None] * torch.tensor([0, 0, math.tau / 40], dtype=torch.float64)
+    )
+    poses = torch.eye(4, dtype=torch.float64).repeat(20, 1, 1)
+    poses[:, :3, :3] = exp_so3(2 * torch.randn(20, 3, generator=draw, dtype=torch.float64))
+    truth = torch.eye(4, dtype=torch.float64).expand(20, 4, 4)
+    every = add(poses[:, None], truth[:, None] @ around, points)
+    found = add_up_to_symmetry(poses, truth, points, around)
+    torch.testing.assert_close(found, every.amin(1), rtol=1e-3, atol=0)
+    assert (every.amax(1) > 1.05 * found).all()
+
+
+def test_only_objects_with_symmetries_are_also_measured_up_to_them() -> None:
+    def turn(degrees: float) -> torch.Tensor:
+        pose, angle = torch.eye(4), torch.tensor(degrees).deg2rad()
+        pose[:2, :2] = torch.stack([angle.cos(), -angle.sin(), angle.sin(), angle.cos()]).view(2, 2)
+        return pose
+
+    around = MODEL._replace(symmetries=torch.stack([turn(a) for a in range(0, 360, 10)]))
+    truth = torch.eye(4).expand(2, 4, 4)
+    poses = torch.stack([turn(95.0), torch.full((4, 4), torch.nan)])  # between two of them; missed
+    plain, symmetric = PoseErrors([MODEL]), PoseErrors([around])
+    for metric in (plain, symmetric):
+        metric.update(poses, truth)
+    found = symmetric.compute()
+    assert "add_up_to_symmetry" not in plain.compute()
+    assert found["add"] == plain.compute()["add"]
+    assert found["add_up_to_symmetry"]["auc"] > 49 > found["add"]["auc"]
+    assert found["add_up_to_symmetry"]["recall_01d"] == 50
+
+
 def test_older_tables_of_errors_have_fewer_columns(tmp_path: Path) -> None:
     row = dict.fromkeys(("scene_id", "im_id", "obj_id"), "1") | {"object": "box", "image": "a"}
     names = ("visibility", "add_mm", "add_s_mm", "diameter_mm", "particles_on_object", "score")
     row |= dict.fromkeys(names, "0.5") | {"seconds": "0.1"}
     old = parse_row(row)
     assert (old.obj_id, old.object, old.add_mm) == (1, "box", 0.5)
-    assert all(math.isnan(x) for x in old[-4:])
+    assert all(math.isnan(x) for x in old[-5:])
     assert parse_row(row | {"presence": "0.25", "more": "x"}).presence == 0.25
     with pytest.raises(ValueError, match="column add_mm is missing"):
         parse_row({name: value for name, value in row.items() if name != "add_mm"})
     file = tmp_path / "errors.csv"
     file.write_text(",".join(row) + "\n" + ",".join(row.values()) + "\n")
-    assert read_errors(file)[0][:-4] == old[:-4]
+    assert read_errors(file)[0][:-5] == old[:-5]
     # errors of 5 and 15 mm of an object of 100 mm
     rows = [old._replace(add_mm=x, add_s_mm=x / 5, diameter_mm=100.0) for x in (5.0, 15.0)]
     found = summarize_errors(rows)

@@ -94,6 +94,14 @@ def test_cells() -> None:
     assert format_spread([0.01, 0.03], share) == "1.0 to 3.0 (sd 1.4)"
 
 
+def test_of_a_symmetric_object_the_best_is_up_to_symmetry(tmp_path: Path) -> None:
+    jobs = [
+        Job({"steps": i}, {"add/auc": plain, "add_up_to_symmetry/auc": symmetric}, str(i))
+        for i, (plain, symmetric) in enumerate(((60.0, 80.0), (40.0, 95.0)))
+    ]
+    assert find_best_job(Sweep(tmp_path, ["steps"], jobs, [])).place == {"steps": 1}
+
+
 def test_where_scores_tie_the_median_names_the_best(sweep: Path) -> None:
     """To one decimal: a hundredth of a point more is no better, a tenth is."""
     best, other = (

@@ -78,7 +78,7 @@ def measure_batch(
         records: The B frames.
     """
     count = len(records)
-    errors = [[math.nan] * count] * 3
+    errors = [[math.nan] * count] * 4
     if "pose" in method.capabilities:
         poses = method.scores["poses"]
         assert isinstance(poses, PoseErrors)
@@ -90,8 +90,8 @@ def measure_batch(
     found = [judged.presence.tolist(), judged.probability.tolist()]
     if "pose" in method.capabilities:
         at_truth = method.scores["credibility"].last()
-        found += [at_truth.log_density.tolist(), at_truth.rank.tolist()]
-    return make_rows(records, batch, *errors, shares, scores, times, *found)
+        found += [at_truth.log_density.tolist(), at_truth.rank.tolist(), errors[3]]
+    return make_rows(records, batch, *errors[:3], shares, scores, times, *found)
 
 
 def make_rows(

@@ -16,10 +16,22 @@ from posefilter.metrics.registry import find_metric, read_number
 _ROWS = (
     "bop/ar", "bop/ar_vsd", "bop/ar_mssd", "bop/ar_mspd",
     "add/auc", "add/recall_01d", "add/recall_2cm", "add/median_mm", "add_s/auc", "add_s/median_mm",
+    "add_up_to_symmetry/auc", "add_up_to_symmetry/median_mm",
     "iou", "parts/box_iou", "parts/mask_iou", "particles_on_object", "seconds_per_image",
 )  # fmt: skip
 _TOLD = (  # to machines
-    *("instances", "missed", "add", "add_s", "mssd", "mspd", "bop", "iou", "parts"),
+    *(
+        "instances",
+        "missed",
+        "add",
+        "add_s",
+        "add_up_to_symmetry",
+        "mssd",
+        "mspd",
+        "bop",
+        "iou",
+        "parts",
+    ),
     *("particles_on_object", "seconds_per_image", "belief"),
 )
 

@@ -11,9 +11,10 @@ from torchmetrics.utilities.data import dim_zero_cat
 from posefilter.geometry.boxes import box_iou
 from posefilter.geometry.pose_error import subsample
 from posefilter.geometry.spaces import PoseSpace
+from posefilter.geometry.symmetries import densify
 from posefilter.metrics.beliefs import entropy, mass_within, on_object, rank_of_truth, spread
-from posefilter.metrics.errors import NearestPoint, add, add_s
-from posefilter.metrics.scores import summarize_rows
+from posefilter.metrics.errors import NearestPoint, add, add_s, add_up_to_symmetry
+from posefilter.metrics.scores import summarize, summarize_rows
 from posefilter.types import BeliefBatch, ObjectModel
 
 
@@ -34,10 +35,10 @@ class Rows(Metric):
 
 
 class PoseErrors(Rows):
-    """ADD and ADD-S of all instances; missed ones and poses that are not finite have infinite
-    error.
+    """ADD and ADD-S of all instances, and ADD up to symmetry where an object has symmetries;
+    missed ones and poses that are not finite have infinite error.
 
-    A row is ADD, ADD-S and the object's diameter [m].
+    A row is ADD, ADD-S, the object's diameter and ADD up to symmetry [m].
 
     Args:
         models: The objects.
@@ -48,6 +49,7 @@ class PoseErrors(Rows):
         super().__init__(**kwargs)
         self.models = list(models)
         self.trees = [NearestPoint(model.points) for model in models]
+        self.symmetries = [densify(model.symmetries.double()) for model in models]
 
     def update(self, poses: Tensor, truth: Tensor, object_id: Tensor | None = None) -> None:
         """Accumulate errors, in the order of the instances.
@@ -59,7 +61,7 @@ class PoseErrors(Rows):
         """
         ids = [0] * len(truth) if object_id is None else object_id.tolist()
         good = poses.isfinite().flatten(1).all(1)
-        rows = torch.full((len(truth), 3), torch.inf, dtype=torch.float64, device=truth.device)
+        rows = torch.full((len(truth), 4), torch.inf, dtype=torch.float64, device=truth.device)
         for index in sorted(set(ids)):
             selected = torch.tensor([i == index for i in ids], device=truth.device)
             model, tree = self.models[index], self.trees[index]
@@ -67,13 +69,25 @@ class PoseErrors(Rows):
             rows[selected & good, 0] = add(a, b, model.points)
             rows[selected & good, 1] = add_s(a, b, tree)
             rows[selected, 2] = model.diameter
+            rows[selected & good, 3] = add_up_to_symmetry(
+                a, b, model.points, self.symmetries[index]
+            )
         self.rows.append(rows)
 
     def compute(self) -> dict[str, Any]:
-        """Return {"instances", "missed", "add": {...}, "add_s": {...}} as in metrics.json."""
-        rows = concat_state(self.rows).reshape(-1, 3)
+        """Return {"instances", "missed", "add": {...}, "add_s": {...}} as in metrics.json, with
+        "add_up_to_symmetry" where an object has symmetries.
+        """
+        rows = concat_state(self.rows).reshape(-1, 4)
         missed = int(rows[:, 0].isinf().sum())
-        return {"instances": len(rows), "missed": missed, **summarize_rows(rows)}
+        return {"instances": len(rows), "missed": missed, **self.summarize(rows)}
+
+    def summarize(self, rows: Tensor) -> dict[str, dict[str, float]]:
+        """Return the blocks of metrics.json of some rows, (N, 4)."""
+        blocks = summarize_rows(rows[:, :3])
+        if any(len(symmetries) > 1 for symmetries in self.symmetries):
+            blocks["add_up_to_symmetry"] = summarize(rows[:, 3], rows[:, 2])
+        return blocks
 
 
 class Average(Metric):

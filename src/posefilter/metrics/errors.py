@@ -8,6 +8,7 @@ from torch import Tensor
 from posefilter.geometry.pose import invert, rotation_of, transform, translation_of
 
 _CHUNK = 1 << 20  # points held at once
+_EXACT, _SOME = 16, 256  # equivalent poses that all points measure, and points that choose them
 
 
 def add(poses: Tensor, truth: Tensor, points: Tensor) -> Tensor:
@@ -31,6 +32,9 @@ def add(poses: Tensor, truth: Tensor, points: Tensor) -> Tensor:
 def add_up_to_symmetry(poses: Tensor, truth: Tensor, points: Tensor, symmetries: Tensor) -> Tensor:
     """Return the least ADD to any of the poses that the object's symmetries make of the truth.
 
+    A continuous symmetry has hundreds of them: the exact error is of the sixteen that are least by
+    some of the points.
+
     Args:
         poses: (B, 4, 4) camera_from_object [m].
         truth: (B, 4, 4).
@@ -40,7 +44,12 @@ def add_up_to_symmetry(poses: Tensor, truth: Tensor, points: Tensor, symmetries:
     Returns:
         (B,) [m].
     """
-    return add(poses[:, None], truth[:, None] @ symmetries.to(truth), points).amin(1)
+    equal = truth[:, None] @ symmetries.to(truth)
+    if len(symmetries) > _EXACT:
+        some = points[:: 1 + len(points) // _SOME]
+        _, likely = add(poses[:, None], equal, some).topk(_EXACT, dim=1, largest=False)
+        equal = equal.gather(1, likely[..., None, None].expand(-1, -1, 4, 4))
+    return add(poses[:, None], equal, points).amin(1)
 
 
 class NearestPoint:

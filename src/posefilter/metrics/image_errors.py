@@ -35,6 +35,7 @@ class ImageError(NamedTuple):
     probability: float = math.nan  # that it is there and the pose right
     log_density: float = math.nan  # of the belief at the truth [nat]
     credible_rank: float = math.nan  # share of the belief that is denser than the truth
+    add_up_to_symmetry_mm: float = math.nan
 
 
 def write_errors(path: Path, rows: Sequence[ImageError]) -> None:

@@ -162,6 +162,7 @@ _METRICS = (
     _count("missed", "missed", LOWER, meaning="images without a finite pose"),
     *_describe_errors("add", "ADD"),
     *_describe_errors("add_s", "ADD-S"),
+    *_describe_errors("add_up_to_symmetry", "ADD up to symmetry"),
     *_describe_bop("mssd", "mm", "0.05 to 0.5 diameters, as in the BOP challenge"),
     *_describe_bop("mspd", "px", "5 to 50 pixels in an image 640 wide"),
     _percent("bop/ar", "BOP average recall", ".1f", HIGHER, meaning="mean of VSD, MSSD and MSPD"),

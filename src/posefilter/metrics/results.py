@@ -8,7 +8,8 @@ from posefilter.metrics.scores import overall
 
 def compute_checkpoint_score(results: dict[str, Any]) -> float:
     """Return the score by which checkpoints are compared, from metrics.json (see `overall`)."""
-    auc = float(results["add"]["auc"]) if results["add"] else None
+    add = results.get("add_up_to_symmetry") or results["add"]
+    auc = float(add["auc"]) if add else None
     return overall(auc, float(results["particles_on_object"] or 0.0), float(results["iou"]))
 
 

@@ -80,8 +80,9 @@ def summarize_rows(rows: Tensor) -> dict[str, dict[str, float]]:
 def overall(add_auc: float | None, on_object: float, iou: float) -> float:
     """Return the score that selects checkpoints and ranks runs, in [0, 100]; higher is better.
 
-    It is the ADD AUC. For detectors, which predict no pose (None), it is the mean of the share of
-    particles on the object and the box IoU: particles can all be on the object long before the
-    predicted box is accurate.
+    It is the ADD AUC; of an object with symmetries that of ADD up to symmetry, since by plain ADD a
+    turn that no image shows would decide. For detectors, which predict no pose (None), it is the
+    mean of the share of particles on the object and the box IoU: particles can all be on the object
+    long before the predicted box is accurate.
     """
     return 50.0 * (on_object + iou) if add_auc is None else add_auc

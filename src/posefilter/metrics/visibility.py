@@ -6,7 +6,6 @@ from typing import Any
 from torch import Tensor
 
 from posefilter.metrics.collect import PoseErrors, concat_state
-from posefilter.metrics.scores import summarize_rows
 from posefilter.types import ObjectModel
 
 # lower end included, upper only at 1
@@ -43,11 +42,11 @@ class ErrorsByVisibility(PoseErrors):
         """Return {"0.3-0.5": {"instances", "add": {...}, "add_s": {...}}, ...} without empty
         ranges.
         """
-        rows, visible = concat_state(self.rows).reshape(-1, 3), concat_state(self.visibility)
+        rows, visible = concat_state(self.rows).reshape(-1, 4), concat_state(self.visibility)
         out = {}
         for low, high in self.ranges:
             selected = (visible >= low) & ((visible < high) if high < 1 else (visible <= 1))
             if bool(selected.any()):
-                parts = summarize_rows(rows[selected])
+                parts = self.summarize(rows[selected])
                 out[f"{low:g}-{high:g}"] = {"instances": int(selected.sum()), **parts}
         return out

@@ -522,7 +522,7 @@ class PoseEstimator(Module):
     def compute_metrics(self) -> dict[str, Any]:
         """Return the metrics since the last reset, in the form of metrics.json."""
         out: dict[str, Any] = {"instances": 0, "missed": 0}
-        out |= dict.fromkeys(("add", "add_s", "mssd", "mspd"))
+        out |= dict.fromkeys(("add", "add_s", "add_up_to_symmetry", "mssd", "mspd"))
         if "poses" in self.scores:
             out |= self.scores["poses"].compute() | self.scores["bop"].compute()
         else:

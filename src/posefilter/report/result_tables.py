@@ -11,6 +11,7 @@ from posefilter.report.gather import Run
 ROWS = (
     "instances", "missed", "add/auc", "add/recall_01d", "add/recall_2cm", "add/median_mm",
     "add_s/auc", "add_s/recall_01d", "add_s/recall_2cm", "add_s/median_mm",
+    "add_up_to_symmetry/auc", "add_up_to_symmetry/recall_01d", "add_up_to_symmetry/median_mm",
     "mssd/ar", "mspd/ar", "iou", "particles_on_object", "seconds_per_image",
 )  # fmt: skip
 
