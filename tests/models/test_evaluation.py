@@ -108,6 +108,23 @@ def test_the_truth_is_outscored_where_the_estimate_scores_higher(
     assert found["truth_outscored_by_misplaced"] == 0.25
 
 
+def test_an_equivalent_pose_that_scores_higher_is_no_wrong_one(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    method, batch = working().eval(), scenes(2)
+    half_turn = torch.diag(torch.tensor([-1.0, -1.0, 1.0, 1.0]))
+    with torch.no_grad():
+        trace = method.predict_step(batch, 0)
+    trace = trace._replace(belief=trace.belief._replace(best=batch.camera_from_object @ half_turn))
+    monkeypatch.setattr(type(method), "_score", lambda *_: torch.tensor([[1.0, 0], [0, 1]]))
+    plain = method.object_model
+    for symmetries, expected in (([torch.eye(4)], 0.5), ([torch.eye(4), half_turn], 0.0)):
+        method.set_object(plain._replace(symmetries=torch.stack(symmetries)))
+        method.update_metrics(trace, batch)
+        found = method.compute_metrics()["belief"]
+        assert (found["truth_outscored"], found["truth_outscored_by_wrong"]) == (0.5, expected)
+
+
 def test_draws_are_of_seed_stage_epoch_and_number_and_in_training_of_the_process() -> None:
     method = working()
 

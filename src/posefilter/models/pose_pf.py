@@ -9,6 +9,7 @@ from torch import Generator, Tensor, nn
 from posefilter.capabilities import Capabilities
 from posefilter.data.absent import hide_annotation
 from posefilter.filters.traces import map_tensors
+from posefilter.geometry.symmetries import densify
 from posefilter.models.candidate_samplers import CandidateSampler
 from posefilter.models.pose_particles import PoseParticles, require_depth
 from posefilter.nets.coordinates import Cells, Coordinates, coordinate_loss
@@ -203,10 +204,11 @@ class PosePF(PoseParticles):
         """Add a batch's errors, and whether the estimate scores higher than the truth does.
 
         A refined estimate outscores the truth by a little even where it is right. The likelihood is
-        at fault where an estimate does so and is wrong (ADD of 0.1 diameters or more), and beyond
-        doubt where its ADD-S is as large: then no look-alike of the truth excuses it.
+        at fault where an estimate does so and is wrong (ADD up to symmetry of 0.1 diameters or
+        more), and beyond doubt where its ADD-S is as large: then no look-alike of the truth excuses
+        it.
         """
-        from posefilter.metrics.errors import add, add_s  # trees of scipy: prediction needs none
+        from posefilter.metrics.errors import add_s, add_up_to_symmetry  # trees of scipy
 
         super().update_metrics(trace, batch)
         encoding = self.encode(hide_annotation(batch))
@@ -218,7 +220,8 @@ class PosePF(PoseParticles):
         sigma = pair.new_tensor(self.comparison_sigma)
         scores = self._score(encoding, pair, sigma, generator, self.comparison_pixels)
         outscored = known & (scores[:, 0] > scores[:, 1])
-        errors = (error(best, truth, self.object_model.points) for error in (add, add_s))
+        points, symmetries = self.object_model.points, densify(self.object_model.symmetries)
+        errors = add_up_to_symmetry(best, truth, points, symmetries), add_s(best, truth, points)
         wrong = [outscored & (error > 0.1 * self.object_model.diameter) for error in errors]
         for name, value in zip(_OUTSCORED, (outscored, *wrong), strict=True):
             self.scores[name].update(value.float())
