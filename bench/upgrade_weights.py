@@ -5,8 +5,9 @@
 `evaluate.py` and the other commands read earlier names too, see `src/posefilter/cli/renamed.py`.
 """
 
-import sys
 from pathlib import Path
+
+from programs import make_parser
 
 from posefilter.cli.checkpoints import read_checkpoint
 from posefilter.cli.files import pack_whole
@@ -28,5 +29,7 @@ def upgrade_file(path: Path) -> bool:
 
 
 if __name__ == "__main__":
-    for name in sys.argv[1:]:
-        print(f"{name}: {'written' if upgrade_file(Path(name)) else 'as it was'}")
+    parser = make_parser(__doc__)
+    parser.add_argument("checkpoint", type=Path, nargs="+")
+    for path in parser.parse_args().checkpoint:
+        print(f"{path}: {'written' if upgrade_file(path) else 'as it was'}")
