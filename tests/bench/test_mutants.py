@@ -103,6 +103,7 @@ def test_endless_and_broken_mutants_are_told_apart(
     assert mutants.try_one(toy, broken, reach) == mutants.BROKEN
 
 
+@pytest.mark.slow
 def test_the_command_prints_its_score(
     mutants: ModuleType, toy: tuple, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -26,6 +26,7 @@ HOME = Path(__file__).parents[2]
 
 
 @pytest.mark.parametrize("more", [[], ["sweep=ablation_detect", "ablation=paper,working"]])
+@pytest.mark.slow
 def test_a_setting_that_only_the_swept_choices_have_reaches_each_job(
     more: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -150,6 +151,7 @@ def test_every_command_shows_where_a_mistake_came_from(
         ("evaluate", "data=fat,ycb_video"),
     ],
 )
+@pytest.mark.slow
 def test_a_sweep_gives_each_job_a_folder_of_its_own(
     command: str, typed: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

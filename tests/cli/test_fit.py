@@ -105,6 +105,7 @@ REFUSED = {
 
 
 @pytest.mark.parametrize("typed", REFUSED)
+@pytest.mark.slow
 def test_a_refusal_names_the_choices_that_fit(typed: str, tmp_path: Path) -> None:
     said = refuse(tmp_path, *typed.split())
     assert "\n" not in said

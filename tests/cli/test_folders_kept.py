@@ -103,6 +103,7 @@ def test_a_command_that_fails_at_once_leaves_no_folder(command: str, tmp_path: P
 
 
 @pytest.mark.parametrize("typed", [["seed=-1"], ["model=pose_pf", "loss=bce"]])
+@pytest.mark.slow
 def test_what_is_above_the_folder_goes_with_it_where_it_is_ours(
     typed: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

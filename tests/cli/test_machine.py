@@ -52,6 +52,7 @@ def test_freed_memory_is_kept_for_the_next_tensor() -> None:
     assert kept < plain / 5
 
 
+@pytest.mark.slow
 def test_a_job_in_a_worker_of_joblib_can_start_processes_of_its_own() -> None:
     """As jobs of `hydra/launcher=joblib` do that render their scenes."""
     loky = pytest.importorskip("joblib.externals.loky", reason="pip install 'posefilter[sweep]'")
@@ -91,6 +92,7 @@ def test_what_is_seeded_is_what_lightning_seeds(monkeypatch: pytest.MonkeyPatch)
 
 
 @pytest.mark.parametrize("command", ["predict", "track", "convert_bag"])
+@pytest.mark.slow
 def test_commands_that_train_nothing_import_no_lightning(command: str) -> None:
     """That alone takes longer than an answer."""
     code = f"import sys, posefilter.cli.{command}; sys.exit('lightning' in sys.modules)"

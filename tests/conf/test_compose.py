@@ -41,7 +41,11 @@ PRESETS = [
     (model, variant) for model in MODELS for variant in list_choices(CONF / "preset" / model)
 ]
 EXPERIMENTS = list_choices(CONF / "experiment")
-SWEEPS = [*list_choices(CONF / "sweep"), "ablation", "ablation_detect", "ablation_pose"]
+ABLATIONS = ("ablation", "ablation_detect", "ablation_pose")
+SWEEPS = [
+    *list_choices(CONF / "sweep"),
+    *(pytest.param(name, marks=pytest.mark.slow) for name in ABLATIONS),
+]
 BUILT = (
     *(f"filter/{step}" for step in ("initialize", "schedule", "reweight", "resample")),
     *(f"filter/{step}" for step in ("propagate", "estimate", "refine")),

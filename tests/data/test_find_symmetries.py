@@ -137,6 +137,7 @@ KNOWN = {  # folds by shape, and by shape and texture
 
 
 @pytest.mark.parametrize("name", KNOWN)
+@pytest.mark.slow
 def test_scans(name: str, real_data: Path) -> None:
     root = real_data / "ycb"
     if not (root / name).is_dir():

@@ -420,6 +420,7 @@ def test_depth_is_stored_in_tenths_of_millimeters_and_never_wraps() -> None:
     np.testing.assert_array_equal(units, [[0, 5000, 65535, 0]])
 
 
+@pytest.mark.slow
 def test_a_script_needs_no_guard_to_render_with_workers(tmp_path: Path) -> None:
     """Spawned processes run a script once more; one that renders would wait for its own lock."""
     script = tmp_path / "script.py"

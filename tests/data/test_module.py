@@ -392,6 +392,7 @@ def test_after_a_whole_epoch_a_run_goes_on_with_the_start_of_the_next(root, limi
     assert first == second
 
 
+@pytest.mark.slow
 def test_a_script_ends_that_still_refers_to_its_loaders_batches(root):
     script = f"""
         from posefilter.data.module import PoseDataModule

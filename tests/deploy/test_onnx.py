@@ -36,6 +36,8 @@ from posefilter.models.zoom import find_place, magnify, measure_zoom
 from posefilter.types import BeliefBatch, Particles
 from printed_objects import load, look
 
+pytestmark = pytest.mark.slow
+
 HOME = Path(__file__).parents[2]
 ENCODING = (
     HOME / "docs" / "scenes" / "003_cracker_box" / "mixed" / "scene0003_0"
@@ -111,7 +113,6 @@ def test_networks_are_those_of_torch(
     compare_networks(exported, estimator, poses, monkeypatch)
 
 
-@pytest.mark.slow
 def test_the_surface_term_is_exported(poses: ModuleType, tmp_path: Path, monkeypatch) -> None:
     pytest.importorskip("onnxscript", reason="needs the extra export")
     drill = posefilter.load("035_power_drill", device="cpu")

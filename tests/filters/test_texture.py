@@ -57,6 +57,7 @@ def turn(
 
 
 @pytest.mark.parametrize("name", ["soup_can", "carton", "tuna_can"])
+@pytest.mark.slow
 def test_a_print_turns_the_shape_back(name: str) -> None:
     model = load(name)
     turns, _ = list_rotations(model)
@@ -175,6 +176,7 @@ def measure_plainly(
 
 @pytest.mark.parametrize("shift", [0.0, 0.002])
 @pytest.mark.parametrize("beside", [0.0, 0.07, -0.09])  # [m] where the frame cuts the object off
+@pytest.mark.slow
 def test_the_part_of_the_image_that_matters_gives_what_the_whole_does(
     shift: float, beside: float
 ) -> None:
@@ -303,6 +305,7 @@ def test_a_turn_between_those_that_are_tried_first_is_found() -> None:
 
 
 @pytest.mark.parametrize("degrees", [-5.0, -2.5, 5.0])
+@pytest.mark.slow
 def test_turns_are_compared_where_their_print_fits_best(
     degrees: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:

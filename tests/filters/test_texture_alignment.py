@@ -58,6 +58,7 @@ def off(found: Tensor, truth: Tensor, model: ObjectModel) -> Tensor:
 
 
 @pytest.mark.parametrize("name", ["carton", "soup_can", "tuna_can"])
+@pytest.mark.slow
 def test_an_estimate_that_is_millimeters_off_is_drawn_to_the_truth(name: str) -> None:
     model, before, after, by_depth = load(name), [], [], []
     for seed, pose in enumerate(draw(name, 8)):

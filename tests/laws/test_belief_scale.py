@@ -83,6 +83,7 @@ def test_the_scale_of_simulated_errors_is_found(too_wide: float) -> None:
 
 
 @pytest.mark.parametrize("too_wide", [0.3, 4.0])
+@pytest.mark.slow
 def test_sets_and_ellipsoids_of_new_frames_hold_the_truth_as_often_as_they_say(
     too_wide: float,
 ) -> None:
@@ -110,6 +111,7 @@ def test_sets_and_ellipsoids_of_new_frames_hold_the_truth_as_often_as_they_say(
     assert 0.35 < float((inside < 3.5).double().mean()) < 0.65
 
 
+@pytest.mark.slow
 def test_a_fit_takes_right_estimates_alone_and_few_of_them_give_none() -> None:
     (beliefs, truth), probability = simulate(40, 1.0, slope=-0.2)
     right = np.arange(40) < 30

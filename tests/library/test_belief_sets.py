@@ -387,6 +387,7 @@ def test_draws_are_of_the_density_and_apart_where_samples_are_copies() -> None:
             belief.draw(wrong)  # type: ignore[arg-type]
 
 
+@pytest.mark.slow
 def test_two_views_are_fused_by_bayes_rule() -> None:
     """One knows x, the other y; of Gaussians the product is known."""
     first, second = SCALE.copy(), SCALE.copy()

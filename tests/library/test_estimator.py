@@ -204,6 +204,7 @@ def test_a_depth_that_is_a_fourth_too_large_is_measured_and_not_believed(
     assert "intrinsics" in warning
 
 
+@pytest.mark.slow
 def test_an_image_of_one_color_or_depth_is_doubted(estimator: posefilter.Estimator) -> None:
     """A black one is answered from the depth alone, with a probability that nothing supports; in
     one of one depth nothing of the box is left, and yet it is not absent.

@@ -109,6 +109,7 @@ def test_a_name_elsewhere_is_fetched_once(
     assert server.asked.count("/weights/duck.ckpt") == 1
 
 
+@pytest.mark.slow
 def test_a_cut_connection_is_tried_again_and_leaves_no_half_file(
     server: Server, tmp_path: Path
 ) -> None:

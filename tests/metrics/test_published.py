@@ -72,6 +72,7 @@ def test_truth_fed_back_scores_full_marks(published: tuple[Tensor, Tensor, Objec
         assert block["median_mm"] < 1e-3
 
 
+@pytest.mark.slow
 def test_a_thousand_poses_take_less_than_two_seconds_of_two_cores(
     published: tuple[Tensor, Tensor, ObjectModel],
 ) -> None:

@@ -145,6 +145,7 @@ def test_a_part_that_is_put_in_later_is_refused_when_the_object_is_set(tmp_path:
 
 @pytest.mark.parametrize("variant", ["paper", "working"])
 @pytest.mark.parametrize("model", ["patch_pf", "pixel_pf"])
+@pytest.mark.slow
 def test_votes_are_refused_where_the_network_reads_the_latent(
     model: str, variant: str, tmp_path: Path
 ) -> None:
@@ -181,6 +182,7 @@ LEGAL = [
 
 
 @pytest.mark.parametrize("model", ["patch_pf", "cnn_patch"])
+@pytest.mark.slow
 def test_all_steps_of_a_training_rollout_have_as_many_particles(model: str, tmp_path: Path) -> None:
     batch = scenes(2)
     method = images(tmp_path, f"model={model}", "model/train_rollout=full", *WIDE)

@@ -85,6 +85,7 @@ def run(method: Hypotheses, count: int = 16, seed: int = 10_000) -> tuple[Trace,
     ("dense_coordinates", 60, 0.04),
     ("keypoints", 60, 0.06),
 ])  # fmt: skip
+@pytest.mark.slow
 def test_a_short_training_finds_the_pose(kind: str, steps: int, most: float) -> None:
     before, (trace, after) = run(make(kind))[1], run(train(make(kind), steps))
     assert before.median() > 0.1

@@ -139,6 +139,7 @@ def teach(method: ImageSpace, steps: int, seed: int = 0) -> None:
 
 
 @pytest.mark.parametrize(("kind", "size"), [(PixelPF, 1), (PatchPF, 3), (Downsized, 9)])
+@pytest.mark.slow
 def test_a_little_teaching_brings_particles_onto_the_object_and_finds_it(
     kind: type[ImageSpace], size: int
 ) -> None:
@@ -166,6 +167,7 @@ def test_a_little_teaching_brings_particles_onto_the_object_and_finds_it(
     ("kind", "size", "loss"),
     [(PixelPF, 1, Add()), (PatchPF, 3, Bce(OnObject(3))), (CnnPatch, 9, Chamfer(9))],
 )
+@pytest.mark.slow
 def test_the_papers_recipe_runs_and_its_loss_falls(
     kind: type[ImageSpace], size: int, loss: Loss
 ) -> None:

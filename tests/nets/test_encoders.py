@@ -44,6 +44,7 @@ def test_no_context_is_empty() -> None:
 @pytest.mark.parametrize(
     "make", [UNetEncoder, lambda: ResNetEncoder(ResNet("resnet18"))], ids=["unet", "resnet18"]
 )
+@pytest.mark.slow
 def test_encoder_learns_where_the_red_square_is(make: Callable[[], nn.Module]) -> None:
     torch.manual_seed(0)
     encoder = make().train()

@@ -32,6 +32,7 @@ def meshes(real_data):
     return MeshStore(real_data / "ycb")
 
 
+@pytest.mark.slow
 def test_real_photographs_fit_their_meshes(real_data, meshes, tmp_path):
     reader = YCBVideoReader(real_data / "ycbv" / "data", None, meshes)
     assert reader.objects[:2] == ("002_master_chef_can", "003_cracker_box")

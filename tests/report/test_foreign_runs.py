@@ -145,6 +145,7 @@ def write_errors(run: Path, number: str) -> None:
 
 @pytest.mark.filterwarnings("error")
 @pytest.mark.parametrize("number", ["nan", "inf", "-inf", "1e30", "-1", "0"])
+@pytest.mark.slow
 def test_errors_of_images_that_are_no_lengths(number: str, run: Path) -> None:
     write_errors(run, number)
     make_page(run)

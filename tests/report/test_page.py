@@ -249,6 +249,7 @@ def test_the_command(
     assert "Sweep over filter.particles (2)" in (there / "elsewhere" / "report.html").read_text()
 
 
+@pytest.mark.slow
 def test_the_sweep_page(sweep: Path) -> None:
     """Means over seeds, the best marked, what is unfinished named; nothing is fetched."""
     found = read_sweep(sweep)

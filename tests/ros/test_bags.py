@@ -490,6 +490,7 @@ def test_color_and_depth_are_nearest_to_one_another(
     assert [*zip([int(one.rgb[0, 0, 0]) for one in frames], depths, strict=True)] == wanted
 
 
+@pytest.mark.slow
 def test_mistakes_are_one_line(tmp_path: Path, capfd) -> None:
     bag = write_scene(tmp_path / "in", (50,))
     near = write_scene(tmp_path / "near", (5,), depth_share=0.01)
@@ -682,6 +683,7 @@ def test_depth_of_another_frame_is_told(tmp_path: Path) -> None:
     assert warnings == [[], [f"{told} aligned to the color?"]]
 
 
+@pytest.mark.slow
 def test_a_wrong_unit_of_depth_is_told_and_no_probability_is_written(tmp_path: Path, capfd) -> None:
     bag, out = write_scene(tmp_path / "in", depth_share=1.4), tmp_path / "found.mcap"
     typed = [f"checkpoint={NAME}", *TYPED, "threads=1"]

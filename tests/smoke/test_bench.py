@@ -8,6 +8,7 @@ import pytest
 from posefilter.data.module import PoseDataModule
 
 
+@pytest.mark.slow
 def test_waiting_for_data_is_measured(
     load_script, tiny_job, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:  # type: ignore[no-untyped-def]

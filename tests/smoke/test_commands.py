@@ -177,6 +177,7 @@ def test_evaluate_finds_what_the_training_found_and_so_do_its_own_estimates(
     assert again["iou"] == pytest.approx(before["iou"], abs=1e-3)
 
 
+@pytest.mark.slow
 def test_pieces_change_at_test_time_and_sweeps_sum_up(
     trained: Path, tiny_scenes: Path, tmp_path: Path
 ) -> None:
@@ -331,6 +332,7 @@ def test_a_mesh_of_another_kind_is_refused(
         evaluate(compose_job("evaluate", HOME / "conf", typed, tmp_path))
 
 
+@pytest.mark.slow
 def test_plain_is_for_machines(
     tiny_scenes: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
@@ -375,6 +377,7 @@ def test_components_that_do_not_fit_are_refused_before_any_training(
 
 
 @pytest.mark.parametrize("resample", ["optimal_transport_sampled", "optimal_transport"])
+@pytest.mark.slow
 def test_particles_are_resampled_by_optimal_transport(
     resample: str, tiny_job, tmp_path: Path
 ) -> None:

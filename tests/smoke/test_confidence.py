@@ -20,6 +20,8 @@ from posefilter.cli.command import compose_job
 from posefilter.errors import UserError
 from posefilter.synthetic.generate import generate
 
+pytestmark = pytest.mark.slow
+
 HOME = Path(__file__).parents[2]
 QUIET = ["console=json", "threads=1"]
 TINY = ["debug=smoke", *QUIET, "logger=none", "data.progress=false", "filter.particles=16"]

@@ -43,6 +43,7 @@ def image() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 # flat print, a shape that any turn about its axis leaves as it is, one that some do
 @pytest.mark.parametrize("name", ["003_cracker_box", "007_tuna_fish_can", "061_foam_brick"])
+@pytest.mark.slow
 def test_an_image_is_searched(name: str, image: tuple[np.ndarray, np.ndarray, np.ndarray]) -> None:
     with simulate_gpu():
         result = posefilter.load(name).predict(*image)

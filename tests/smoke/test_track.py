@@ -29,6 +29,8 @@ from posefilter.metrics.bop_results import read_poses_csv
 from posefilter.tracking.records import TrackRow
 from posefilter.tracking.settings import TrackerSettings
 
+pytestmark = pytest.mark.slow
+
 HOME = Path(__file__).parents[2]
 SCENE = HOME / "docs" / "scenes" / "003_cracker_box" / "mixed" / "scene0003_0"
 FEW = [
@@ -354,7 +356,6 @@ def test_a_view_of_the_tracks_is_written(folder: Path, tmp_path: Path) -> None:
     assert (out / "view.rrd").stat().st_size > 10_000
 
 
-@pytest.mark.slow
 def test_a_scene_of_a_dataset_is_tracked_with_its_errors(tmp_path: Path) -> None:
     """Its frames are of one scene each: a video of one frame is a single estimate."""
     root = SCENE.parents[1]

@@ -29,6 +29,7 @@ def evaluate(
     return metrics, [line for line in lines if line["event"] == "warning"]
 
 
+@pytest.mark.slow
 def test_depth_of_another_scale_is_told(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     metrics, warnings = evaluate(SCENES, tmp_path / "right", capfd)
     assert metrics["apparent_size"] == {

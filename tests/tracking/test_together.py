@@ -84,6 +84,7 @@ def check_same(
 
 
 @pytest.mark.parametrize("threads", [2, 3, 4])
+@pytest.mark.slow
 def test_objects_side_by_side_are_where_they_are_one_after_the_other(threads: int) -> None:
     torch.set_num_threads(1)
     toys = [SeeingToy(make_poses()), SeeingToy(make_poses(range(4, 8))), SeeingToy(make_poses())]
@@ -110,6 +111,7 @@ def test_an_error_of_one_object_is_raised_and_the_others_go_on() -> None:
     assert all(result.is_tracked for result in follow(tracker, [4])[0])
 
 
+@pytest.mark.slow
 def test_nothing_is_lost_with_a_process_that_ends() -> None:
     toys = [Failing(make_poses(), 5, None) for _ in range(2)]
     alone = follow(make_tracker(toys))
