@@ -205,7 +205,14 @@ def list_units() -> list[Line]:
     channels, for time, and the paper's 30 steps.
     """
     untrained = f"experiment=memorize variant=paper {UNTRAINED} callbacks=checkpoints"
-    lines = [Line("unit_untrained", f"{FOUR} {untrained} {UNITS} seed=0,1,2")]
+    lines = [
+        Line("unit_untrained", f"{FOUR} {untrained} {UNITS} seed=0,1,2"),
+        # what to hold the other seeds of patch_pf in unit_full against
+        Line(
+            "unit_untrained",
+            f"model=patch_pf {untrained} model.displacement.unit=10,1,learned seed=3,4",
+        ),
+    ]
     paper = "experiment=memorize ablation=paper callbacks=checkpoints"
     # what to hold the trained filter with a pose against
     lines.append(
