@@ -95,7 +95,7 @@ def read_photographs(root: str, meshes: str, names: Sequence[str], max_images: i
 def read_renders(
     root: str, meshes: str, names: Sequence[str], max_images: int, part: str
 ) -> list[Shown]:
-    """Return held-out renders that show the objects, those of bench/held_out.py."""
+    """Return renders that show the objects, of the split of bench/held_out.py."""
     reader = open_reader("fat", root, None, open_meshes(meshes, None, "fat", list(names)))
     chosen = split_records(reader.records(), SPLIT, 0, Path(root))[part]
     out = []

@@ -182,7 +182,7 @@ def main() -> int:
         parser.add_argument(f"--python-{name}", help=f"the interpreter that has {name}")
     parser.add_argument("--frames", help="a folder of YCB-Video")
     parser.add_argument("--meshes", help="a folder of YCB's meshes")
-    parser.add_argument("--renders", help="a folder of bench/photographs.py's renders")
+    parser.add_argument("--renders", help="a folder of renders, one folder an object")
     parser.add_argument("--render-meshes", help="their meshes")
     parser.add_argument("--visp", help="what worker_visp.cpp compiles to")
     parser.add_argument("--only", action="append", help="an object; can be repeated")
