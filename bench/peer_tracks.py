@@ -130,12 +130,11 @@ def compare(
     sequence.unlink()
     judged = {}
     for way, runs in out.items():
-        errors = [
-            [f(torch.from_numpy(poses), truth, points) for f in (add, add_s)] for poses, _ in runs
+        scores = [
+            [auc(error(torch.from_numpy(poses), truth, points)) for error in (add, add_s)]
+            for poses, _ in runs
         ]
-        plain, symmetric = (
-            float(np.mean([auc(e) for e in kind])) for kind in zip(*errors, strict=True)
-        )
+        plain, symmetric = np.mean(scores, axis=0).tolist()
         took = np.concatenate([took[1:] for _, took in runs])
         judged[way] = (plain, symmetric, 1000 * float(np.median(took)))
     return judged

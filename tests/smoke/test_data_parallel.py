@@ -74,9 +74,9 @@ def test_two_processes_stop_together(tmp_path: Path, tiny_scenes: Path) -> None:
         while not last.is_file() and process.poll() is None:  # both train
             time.sleep(0.05)
         os.killpg(process.pid, signal.SIGINT)  # as a terminal's Ctrl-C does
-        told, err = process.communicate(timeout=120)
+        output, err = process.communicate(timeout=120)
     assert process.returncode == 130, err
     assert "Traceback" not in err
-    stopped = json.loads(told.splitlines()[-1])
+    stopped = json.loads(output.splitlines()[-1])
     assert stopped["event"] == "stopped"
     assert torch.load(last, weights_only=True)["global_step"] == stopped["step"] > 0

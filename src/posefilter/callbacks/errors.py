@@ -78,11 +78,11 @@ def measure_batch(
         records: The B frames.
     """
     count = len(records)
-    errors = [[math.nan] * count] * 4
+    add, add_s, diameter, up_to_symmetry = [[math.nan] * count] * 4
     if "pose" in method.capabilities:
         poses = method.scores["poses"]
         assert isinstance(poses, PoseErrors)
-        errors = (1000 * poses.rows[-1]).T.tolist()
+        add, add_s, diameter, up_to_symmetry = (1000 * poses.rows[-1]).T.tolist()
     shares = on_object(batch.mask, method.particle_pixels(trace.particles[-1], batch)).tolist()
     seconds = method.seconds_per_image[-1] if method.seconds_per_image else math.nan
     scores, times = trace.belief.score.tolist(), [seconds] * count
@@ -90,8 +90,8 @@ def measure_batch(
     found = [judged.presence.tolist(), judged.probability.tolist()]
     if "pose" in method.capabilities:
         at_truth = method.scores["credibility"].last()
-        found += [at_truth.log_density.tolist(), at_truth.rank.tolist(), errors[3]]
-    return make_rows(records, batch, *errors[:3], shares, scores, times, *found)
+        found += [at_truth.log_density.tolist(), at_truth.rank.tolist(), up_to_symmetry]
+    return make_rows(records, batch, add, add_s, diameter, shares, scores, times, *found)
 
 
 def make_rows(

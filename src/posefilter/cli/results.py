@@ -20,20 +20,9 @@ _ROWS = (
     "iou", "parts/box_iou", "parts/mask_iou", "particles_on_object", "seconds_per_image",
 )  # fmt: skip
 _TOLD = (  # to machines
-    *(
-        "instances",
-        "missed",
-        "add",
-        "add_s",
-        "add_up_to_symmetry",
-        "mssd",
-        "mspd",
-        "bop",
-        "iou",
-        "parts",
-    ),
-    *("particles_on_object", "seconds_per_image", "belief"),
-)
+    "instances", "missed", "add", "add_s", "add_up_to_symmetry", "mssd", "mspd", "bop", "iou",
+    "parts", "particles_on_object", "seconds_per_image", "belief",
+)  # fmt: skip
 
 
 def record(

@@ -9,7 +9,6 @@ from torch import Generator, Tensor, nn
 from posefilter.capabilities import Capabilities
 from posefilter.data.absent import hide_annotation
 from posefilter.filters.traces import map_tensors
-from posefilter.geometry.symmetries import densify
 from posefilter.models.candidate_samplers import CandidateSampler
 from posefilter.models.pose_particles import PoseParticles, require_depth
 from posefilter.nets.coordinates import Cells, Coordinates, coordinate_loss
@@ -208,8 +207,6 @@ class PosePF(PoseParticles):
         more), and beyond doubt where its ADD-S is as large: then no look-alike of the truth excuses
         it.
         """
-        from posefilter.metrics.errors import add_s, add_up_to_symmetry  # trees of scipy
-
         super().update_metrics(trace, batch)
         encoding = self.encode(hide_annotation(batch))
         truth, best = batch.camera_from_object, trace.belief.best
@@ -220,9 +217,8 @@ class PosePF(PoseParticles):
         sigma = pair.new_tensor(self.comparison_sigma)
         scores = self._score(encoding, pair, sigma, generator, self.comparison_pixels)
         outscored = known & (scores[:, 0] > scores[:, 1])
-        points, symmetries = self.object_model.points, densify(self.object_model.symmetries)
-        errors = add_up_to_symmetry(best, truth, points, symmetries), add_s(best, truth, points)
-        wrong = [outscored & (error > 0.1 * self.object_model.diameter) for error in errors]
+        _, misplaced, diameter, error = self.scores["poses"].rows[-1].T  # of this batch
+        wrong = [outscored & (one > 0.1 * diameter) for one in (error, misplaced)]
         for name, value in zip(_OUTSCORED, (outscored, *wrong), strict=True):
             self.scores[name].update(value.float())
 
