@@ -3,6 +3,7 @@ in one good line.
 """
 
 import re
+from collections.abc import Callable
 from itertools import product
 from pathlib import Path
 
@@ -65,6 +66,20 @@ def test_every_variant_of_every_model_builds_with_a_legal_loss(model: str, varia
     method = build_method(recipe(job))
     assert any(p.requires_grad for p in method.parameters())
     assert method.filter.particles == job.cfg.filter.particles
+
+
+def test_tests_compose_what_hydra_alone_composes(
+    composing_by_hydra_alone: Callable[[pytest.MonkeyPatch], None],
+    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path,
+) -> None:
+    """`preset` is interpolated, and an ablation comes from the store."""
+    overrides = ("model=patch_pf", "ablation=c5_displacement_loss", "seed=3")
+    ours = compose(tmp_path, *overrides)
+    composing_by_hydra_alone(monkeypatch)
+    theirs = compose(tmp_path, *overrides)
+    assert theirs.cfg == ours.cfg
+    assert theirs.choices == ours.choices
 
 
 @pytest.mark.parametrize(("model", "variant"), PRESETS)
