@@ -57,6 +57,12 @@ def belief_of(part: slice) -> BeliefBatch:
     return BeliefBatch(CLOUD[part], log_w, CLOUD[part, 0], log_w[:, 0])
 
 
+def measure(part: slice) -> torch.Tensor:
+    errors = PoseErrors([MODEL])
+    errors.update(GUESS[part], TRUTH[part])
+    return errors.rows[0]
+
+
 TRUTH, GUESS = BATCH.camera_from_object, CLOUD[:, 0]
 SEEN = torch.linspace(0.1, 1.0, IMAGES)
 SCORES = TruthScores(*NUMBERS[:3, :, 0].double())
@@ -68,7 +74,7 @@ KINDS: dict[str, tuple[Callable[..., Metric], Callable[[Any, slice], None]]] = {
     ),
     "by visibility": (
         lambda **kwargs: ErrorsByVisibility([MODEL], **kwargs),
-        lambda metric, part: metric.collect(GUESS[part], TRUTH[part], SEEN[part]),
+        lambda metric, part: metric.update(measure(part), SEEN[part]),
     ),
     "BOP": (
         lambda **kwargs: BopErrors([MODEL], **kwargs),

@@ -4,7 +4,14 @@ import torch
 from tests.models.toy import square
 
 from posefilter.geometry.pose import make_pose
+from posefilter.metrics.collect import PoseErrors
 from posefilter.metrics.visibility import ErrorsByVisibility
+
+
+def measure(poses: torch.Tensor, truth: torch.Tensor) -> torch.Tensor:
+    errors = PoseErrors([square()])
+    errors.update(poses, truth)
+    return errors.rows[0]
 
 
 def test_each_range_has_its_own_instances() -> None:
@@ -14,8 +21,8 @@ def test_each_range_has_its_own_instances() -> None:
         torch.eye(3).expand(5, 3, 3), torch.stack([shifts, shifts * 0, shifts * 0], -1)
     )
     metric = ErrorsByVisibility([square()])
-    metric.collect(poses[:3], truth[:3], torch.tensor([1.0, 0.4, 0.3]))
-    metric.collect(poses[3:], truth[3:], torch.tensor([0.7, float("nan")]))
+    metric.update(measure(poses[:3], truth[:3]), torch.tensor([1.0, 0.4, 0.3]))
+    metric.update(measure(poses[3:], truth[3:]), torch.tensor([0.7, float("nan")]))
     got = metric.compute()
     assert set(got) == {"0.3-0.5", "0.5-0.8", "0.8-1", "0.5-1", "0.6-1"}
     assert got["0.3-0.5"]["instances"] == 2
@@ -30,6 +37,6 @@ def test_each_range_has_its_own_instances() -> None:
 def test_a_share_between_two_ranges_is_of_the_higher_one() -> None:
     metric = ErrorsByVisibility([square()], ranges=((0.25, 0.5), (0.5, 0.75), (0.75, 1.0)))
     truth = torch.eye(4).expand(4, 4, 4)
-    metric.collect(truth, truth, torch.tensor([0.25, 0.5, 0.75, 1.0]))
+    metric.update(measure(truth, truth), torch.tensor([0.25, 0.5, 0.75, 1.0]))
     counted = {name: found["instances"] for name, found in metric.compute().items()}
     assert counted == {"0.25-0.5": 1, "0.5-0.75": 1, "0.75-1": 2}

@@ -80,14 +80,15 @@ class PoseErrors(Rows):
         """
         rows = concat_state(self.rows).reshape(-1, 4)
         missed = int(rows[:, 0].isinf().sum())
-        return {"instances": len(rows), "missed": missed, **self.summarize(rows)}
+        return {"instances": len(rows), "missed": missed, **summarize_errors(rows, self.models)}
 
-    def summarize(self, rows: Tensor) -> dict[str, dict[str, float]]:
-        """Return the blocks of metrics.json of some rows, (N, 4)."""
-        blocks = summarize_rows(rows[:, :3])
-        if any(len(symmetries) > 1 for symmetries in self.symmetries):
-            blocks["add_up_to_symmetry"] = summarize(rows[:, 3], rows[:, 2])
-        return blocks
+
+def summarize_errors(rows: Tensor, models: Sequence[ObjectModel]) -> dict[str, dict[str, float]]:
+    """Return the blocks of metrics.json of rows of PoseErrors, (N, 4), of some objects."""
+    blocks = summarize_rows(rows[:, :3])
+    if any(len(model.symmetries) > 1 for model in models):
+        blocks["add_up_to_symmetry"] = summarize(rows[:, 3], rows[:, 2])
+    return blocks
 
 
 class Average(Metric):

@@ -448,7 +448,7 @@ class PoseEstimator(Module):
         if "poses" in self.scores:
             self.scores["poses"].update(best, true_pose)
             self.scores["bop"].update(best, true_pose, batch.intrinsics, width)
-            self.scores["by_visibility"].collect(best, true_pose, batch.visibility)
+            self.scores["by_visibility"].update(self.scores["poses"].rows[-1], batch.visibility)
             found = self.judge_confidence(trace, batch, present=True)
             belief, _ = self.calibrate_belief(trace.belief, found)
             self.last_belief = belief
