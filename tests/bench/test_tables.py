@@ -4,10 +4,11 @@ import csv
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from statistics import stdev
+from statistics import fmean, stdev
 from types import ModuleType
 
 import pytest
+from scipy.stats import t as student_t
 
 HOME = Path(__file__).parents[2]
 
@@ -106,6 +107,42 @@ def test_every_table_of_the_documents_is_what_the_runs_say(tables: ModuleType) -
     assert len(pages) >= 3
     for page in pages:
         assert tables.fill_page(page.read_text(), rows) == page.read_text(), page
+
+
+def measure_change(row: dict[str, str], figure: str) -> float:
+    return float(row[f"{figure} %"]) - float(row[f"{figure} at start %"])
+
+
+@pytest.mark.parametrize(
+    ("table", "method", "unit", "figure", "sign", "said"),
+    [
+        ("unit_untrained", "patch_pf", "10", "on object", -1, "{} at 10 pixels and"),
+        ("unit_untrained", "patch_pf", "1", "on object", -1, "{} at 1 pixel (five seeds each)"),
+        ("unit_untrained", "patch_pf", "half_frame", "along a line", 1, "{} at half a frame"),
+        ("unit_untrained", "patch_pf", "10", "along a line", 1, "{} at 10 pixels and 22"),
+        ("unit_untrained", "patch_pf", "1", "along a line", 1, "{} at 1 (five seeds)"),
+        ("unit_full", "patch_pf", "1", "on object", -1, "by seed {} are lost"),
+        ("unit_full", "cnn_patch", "1", "on object", 1, "`cnn_patch` gains {} at 1 pixel"),
+        ("unit_full", "cnn_patch", "10", "on object", 1, "{} at 10 and 44"),
+        ("unit_full", "downsized", "1", "on object", 1, "`downsized` {}, 74"),
+        ("memorize", "pixel_pf", None, "on object", 1, "The gain is {}, that of"),
+    ],
+)
+def test_intervals_in_the_text_are_of_the_runs_that_there_are(
+    table: str, method: str, unit: str | None, figure: str, sign: int, said: str
+) -> None:
+    """More seeds change the tables by a command, and the sentences about them by hand."""
+    with (HOME / "docs" / "results" / "runs.csv").open() as file:
+        own = [r for r in csv.DictReader(file) if (r["table"], r["method"]) == (table, method)]
+    chosen = [r for r in own if r["variant"] == "paper"]
+    if unit is not None:
+        chosen = [r for r in own if f"model.displacement.unit={unit}" in r["changed"].split()]
+    changes = [sign * measure_change(row, figure) for row in chosen]
+    half = student_t.ppf(0.975, len(changes) - 1) * stdev(changes) / len(changes) ** 0.5
+    ends = (fmean(changes) - half, fmean(changes) + half)
+    low, high = (f"{end:.0f}" if abs(end) >= 0.5 else f"{end:.1f}" for end in ends)
+    page = (HOME / "docs" / "analysis" / "failures.md").read_text().replace(" points", "")
+    assert said.format(f"{fmean(changes):.0f} [{low}, {high}]") in page
 
 
 def test_a_stale_page_fails_the_check(

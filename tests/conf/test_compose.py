@@ -163,6 +163,27 @@ def test_the_papers_pose_filter_has_the_papers_figures(tmp_path: Path) -> None:
     assert (method.filter.particles, method.filter.steps, method.proposals) == (1000, 100, None)
 
 
+def test_the_page_on_the_pose_filter_names_all_that_leaves_the_paper() -> None:
+    """With what the table's last column names, the working variant is the paper's."""
+    paper = compose_once("variant=paper")
+    page = (HOME / "docs" / "pose_pf.md").read_text()
+    section = page.split("## Differences from the paper")[1].split("What each is worth")[0]
+    rows = [line.split(" | ")[-1] for line in section.splitlines() if line.startswith("| ")]
+    named = [
+        word for row in rows for code in re.findall(r"`([^`]+)`", row) for word in code.split()
+    ]
+    restored = []
+    for word in dict.fromkeys(named):
+        key, value = word.split("=", 1)
+        own = paper.choices.get(key, OmegaConf.select(paper.cfg, key))
+        if str(own).lower() == value.replace("null", "none"):  # others are steps on the way
+            restored.append(word)
+    # of the batch, whose size and length are not of the method
+    found = compose_once(*restored, "model.likelihood_batch_size=null")
+    for part in ("model", "loss", "filter", "optimizer", "scheduler", "data.augment"):
+        assert OmegaConf.select(found.cfg, part) == OmegaConf.select(paper.cfg, part), part
+
+
 @pytest.mark.parametrize("experiment", EXPERIMENTS)
 @pytest.mark.parametrize("model", MODELS)
 def test_every_experiment_builds(experiment: str, model: str, tmp_path: Path) -> None:

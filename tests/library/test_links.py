@@ -1,4 +1,4 @@
-"""Links of the documents lead to files and headings that there are."""
+"""Links and commands of the documents name files and headings that there are."""
 
 import re
 from pathlib import Path
@@ -30,3 +30,15 @@ def test_every_link_leads_somewhere(page: Path) -> None:
             assert DOCS in target.parents, f"{place}: is not on the site"
         if anchor:
             assert anchor in list_anchors(target), f"{place}#{anchor}: no such heading"
+
+
+@pytest.mark.parametrize("page", _PAGES, ids=lambda page: str(page.relative_to(HOME)))
+def test_every_command_names_what_there_is(page: Path) -> None:
+    text = page.read_text(encoding="utf-8")
+    named = re.findall(
+        r"(?:\bpython |--config-dir |PYTHONPATH=)((?:bench|conf|docs|examples|tests)/[\w./-]*)",
+        text,
+    )
+    named += re.findall(r"\bpython (\w+\.py)\b", text)
+    for path in named:
+        assert (HOME / path).exists(), f"{path}: no such file"
