@@ -344,6 +344,11 @@ def list_choices() -> list[Line]:
     return [
         Line("choices", f"{pixel} loss=add loss.weighting=mean,likelihood {seeds}"),
         Line("choices", f"{patch} {unit} model.net.displacement_input=logit,likelihood {seeds}"),
+        *(
+            Line("choices", f"{size} {last} model.displacement.unit=half_frame,1 seed=0,1,2,3,4")
+            for last in ("model.net.last_layer=relu", f"model.net.last_layer=relu {UNTRAINED}")
+            for size in (pixel, patch)
+        ),
         Line("choices", f"{patch} loss=add loss.weighting=likelihood {seeds}"),
         Line("choices", f"{detector} loss=chamfer_rgbd {seeds}"),
         Line("choices", f"{detector} loss.max_pixels=null {seeds}"),

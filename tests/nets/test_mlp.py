@@ -59,6 +59,22 @@ def test_the_displacement_reads_the_logit_or_the_likelihood() -> None:
         LatentNet(0, 1, displacement_input="odds")
 
 
+def test_a_last_layer_with_a_relu_has_no_negative_output() -> None:
+    """Particles then move right and down alone."""
+    torch.manual_seed(0)
+    size = {"latent_width": 8, "width": 16, "normalization": "batch"}
+    for last_layer, least in (("linear", False), ("relu", True)):
+        net = LatentNet(0, 1, last_layer=last_layer, **size)
+        out = net(torch.rand(8, 50, 4, 1, 1), torch.zeros(8, 50, 0), torch.zeros(8, 50, 8))
+        for part in (out.latent, out.logit, out.displacement, out.pose):
+            assert (bool(part.min() >= 0)) == least
+            assert part.std() > 0
+    with pytest.raises(UserError, match=r"last_layer=relu: needs model\.net\.normalization=batch"):
+        LatentNet(0, 1, last_layer="relu", normalization="layer")
+    with pytest.raises(UserError, match="choose linear or relu"):
+        LatentNet(0, 1, last_layer="tanh")
+
+
 @pytest.mark.parametrize("kernel", [1, 5])
 def test_the_kernel_decides_what_a_convolution_sees(kernel: int) -> None:
     """Three layers reach three times half a kernel: what lies further off changes nothing."""

@@ -53,13 +53,22 @@ class Mlp(nn.Sequential):
         return out.unflatten(0, x.shape[:-1])
 
 
-def mlp(inputs: int, outputs: int, width: int, layers: int, normalization: str) -> Mlp:
-    """Return `layers` linear layers, each but the last followed by a normalization and a ReLU."""
+def mlp(
+    inputs: int,
+    outputs: int,
+    width: int,
+    layers: int,
+    normalization: str,
+    last_layer: str = "linear",
+) -> Mlp:
+    """Return `layers` linear layers, each followed by a normalization and a ReLU; the last only if
+    `last_layer` is "relu".
+    """
     parts: list[nn.Module] = []
-    for _ in range(layers - 1):
-        parts += [Linear(inputs, width), ParticleNorm(normalization, width), nn.ReLU(inplace=True)]
-        inputs = width
-    return Mlp(*parts, Linear(inputs, outputs))
+    for size in [width] * (layers - 1) + [outputs]:
+        parts += [Linear(inputs, size), ParticleNorm(normalization, size), nn.ReLU(inplace=True)]
+        inputs = size
+    return Mlp(*parts) if last_layer == "relu" else Mlp(*parts[:-2])
 
 
 class LatentNet(nn.Module):
@@ -77,6 +86,12 @@ class LatentNet(nn.Module):
         layers: Linear layers of each MLP.
         normalization: "batch" or "layer".
         displacement_input: "logit" or "likelihood" (its sigmoid), beside pose and latent.
+        last_layer: Of each MLP: "linear", or "relu", with normalization and ReLU as all others. No
+            output is negative then, so that particles move right and down alone.
+
+    Raises:
+        UserError: A size is below 1, or `last_layer` is "relu" without batch normalization: that of
+            a single output by itself is constant.
     """
 
     def __init__(
@@ -89,9 +104,16 @@ class LatentNet(nn.Module):
         layers: int = 4,
         normalization: str = "batch",
         displacement_input: str = "logit",
+        last_layer: str = "linear",
     ) -> None:
         super().__init__()
         check_choice("model.net.displacement_input", displacement_input, "logit", "likelihood")
+        check_choice("model.net.last_layer", last_layer, "linear", "relu")
+        if last_layer == "relu" and normalization != "batch":
+            raise UserError(
+                f"model.net.last_layer=relu: needs model.net.normalization=batch, not "
+                f"{normalization}, which makes a single output constant"
+            )
         if min(latent_width, width, layers) < 1:
             raise UserError(
                 f"net: latent_width={latent_width}, width={width} and layers={layers} "
@@ -99,7 +121,7 @@ class LatentNet(nn.Module):
             )
         self.displacement_input = displacement_input
         self.latent_width = latent_width
-        hidden = (width, layers, normalization)
+        hidden = (width, layers, normalization, last_layer)
         self.latent = mlp(4 * size * size + extra + latent_width, latent_width, *hidden)
         self.pose = mlp(latent_width, pose_width, *hidden)
         self.likelihood = mlp(latent_width, 1, *hidden)
