@@ -8,17 +8,19 @@ import pytest
 import torch
 from tests.models.toy import scenes, square
 
+from posefilter.confidence.tolerance import measure_pose_errors
 from posefilter.errors import UserError
-from posefilter.geometry.pose import make_pose, transform
-from posefilter.geometry.rotation import exp_so3
+from posefilter.geometry.pose import make_pose, origin_of, pose_about, rotation_of, transform
+from posefilter.geometry.rotation import exp_so3, random_rotation
 from posefilter.geometry.spaces import PoseSpace
-from posefilter.geometry.symmetries import densify
-from posefilter.meshes.symmetries import symmetry_group
+from posefilter.geometry.symmetries import densify, is_ball
+from posefilter.meshes.symmetries import rotation_about, symmetry_group
 from posefilter.metrics.bop import (
     MSPD_THRESHOLDS,
     MSSD_THRESHOLDS,
     BopErrors,
     average_recall,
+    mssd,
 )
 from posefilter.metrics.bop_results import HEADER, PoseRow, read_poses_csv, write_poses_csv
 from posefilter.metrics.collect import BeliefQuality, PoseErrors
@@ -150,6 +152,47 @@ def test_a_symmetry_of_few_digits_is_filled_in_about_its_axis() -> None:
     # turns of 15 degrees are few, but all that there are
     few = torch.from_numpy(symmetry_group(continuous=[(axis, point)], steps=24))
     assert densify(few) is few
+
+
+def make_ball() -> tuple[torch.Tensor, torch.Tensor]:
+    """Return a ball's symmetries, about a point that is not the origin, and points of it."""
+    lines = [
+        (np.array([1.0, 0, 0]), np.array([0.3, 0.05, 0.02])),
+        (np.array([0.0, 0.8, 0.6]), np.array([0.1, 0.13, 0.08])),
+    ]
+    symmetries = torch.from_numpy(symmetry_group(continuous=lines, steps=36))
+    center = torch.tensor([0.1, 0.05, 0.02]).double()
+    points = center + 0.035 * torch.nn.functional.normalize(torch.randn(200, 3).double(), dim=1)
+    return symmetries, points
+
+
+def test_a_ball_may_be_turned_anyhow() -> None:
+    symmetries, points = make_ball()
+    center = torch.tensor([0.1, 0.05, 0.02]).double()
+    assert is_ball(symmetries)
+    assert densify(symmetries) is symmetries
+    torch.testing.assert_close(transform(symmetries, center[None])[:, 0], center.expand(1296, 3))
+    anyhow = random_rotation(300).double()
+    near = anyhow[:, None].mT @ rotation_of(symmetries)
+    cosine = (near.diagonal(dim1=-2, dim2=-1).sum(-1).amax(1) - 1) / 2
+    assert math.degrees(float(cosine.min().acos())) < 20  # of the nearest that is known
+    truth = make_pose(anyhow[:150], torch.tensor([0.0, 0.0, 1.0]).double())
+    poses = pose_about(anyhow[150:], origin_of(truth, center), center)
+    poses[..., 0, 3] += 0.003
+    off = torch.full((150,), 0.003).double()
+    torch.testing.assert_close(add_up_to_symmetry(poses, truth, points, symmetries), off)
+    torch.testing.assert_close(mssd(poses, truth, symmetries, points), off)
+    model = MODEL._replace(symmetries=symmetries, points=points, center=center)
+    errors = measure_pose_errors(poses, truth, model)
+    torch.testing.assert_close(errors.translation, off)
+    assert float(errors.rotation.max()) < 1e-3
+
+
+@pytest.mark.parametrize("flip", [False, True])
+def test_what_turns_about_one_axis_is_no_ball(flip: bool) -> None:
+    half = [rotation_about(np.array([1.0, 0, 0]), np.pi, np.zeros(3))] if flip else []
+    turns = symmetry_group(half, [(np.array([0, 0, 1.0]), np.zeros(3))], steps=144)
+    assert not is_ball(torch.from_numpy(turns))
 
 
 def write_row(path: Path, **changes: str) -> Path:

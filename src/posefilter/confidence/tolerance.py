@@ -16,7 +16,7 @@ from torch import Tensor
 from posefilter.errors import UserError
 from posefilter.geometry.pose import origin_of, rotation_of
 from posefilter.geometry.rotation import angle_between
-from posefilter.geometry.symmetries import densify
+from posefilter.geometry.symmetries import densify, list_equivalent
 from posefilter.types import ObjectModel
 
 
@@ -115,7 +115,7 @@ def measure_pose_errors(poses: Tensor, truth: Tensor, object_model: ObjectModel)
     truth, points = truth.to(poses), object_model.points.to(poses)
     known = poses.isfinite().flatten(1).all(1)
     poses = torch.where(known[:, None, None], poses, truth)
-    equal = truth[:, None] @ densify(object_model.symmetries.double()).to(truth)
+    equal = list_equivalent(poses, truth, densify(object_model.symmetries.double()))
     distances = add(poses[:, None], equal, points)
     least, which = distances.min(1)
     near = equal[torch.arange(len(equal)), which]

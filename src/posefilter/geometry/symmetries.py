@@ -5,7 +5,13 @@ import math
 import torch
 from torch import Tensor
 
-from posefilter.geometry.pose import origin_of, rotation_of, transform, translation_of
+from posefilter.geometry.pose import (
+    origin_of,
+    pose_about,
+    rotation_of,
+    transform,
+    translation_of,
+)
 from posefilter.geometry.rotation import exp_so3, log_so3, quat_xyzw_from_matrix
 
 # [rad] a group whose least turn is smaller stands for a continuous symmetry
@@ -24,8 +30,10 @@ def densify(symmetries: Tensor, step: float = _STEP) -> Tensor:
         step: The largest angle between neighbors [rad].
 
     Returns:
-        (S', 4, 4); as given where no turn is smaller than 15 degrees.
+        (S', 4, 4); as given where no turn is smaller than 15 degrees, and for a ball.
     """
+    if is_ball(symmetries):
+        return symmetries
     turns = log_so3(rotation_of(symmetries))
     angles = turns.norm(dim=-1)
     least = angles.masked_fill(angles < 1e-4, torch.inf).argmin()
@@ -42,6 +50,37 @@ def densify(symmetries: Tensor, step: float = _STEP) -> Tensor:
         part[:3, 3] = point - part[:3, :3] @ point
         parts.append(symmetries @ part)
     return torch.cat(parts)
+
+
+def is_ball(symmetries: Tensor) -> bool:
+    """Tell whether symmetries (S, 4, 4) stand for all rotations about a point.
+
+    The mean square of the trace is then 1. It is 2 or more where one axis is left, and of the
+    finite groups of which it is 1 the largest is the icosahedron's, of 60.
+    """
+    traces = rotation_of(symmetries).diagonal(dim1=-2, dim2=-1).sum(-1)
+    return len(symmetries) > 60 and bool(traces.square().mean() < 1.5)
+
+
+def list_equivalent(poses: Tensor, truth: Tensor, symmetries: Tensor) -> Tensor:
+    """Return the poses equivalent to a true one, of which one is nearest to the estimate: all that
+    are known, and of a ball the one that is turned as the estimate is.
+
+    Args:
+        poses: (*, 4, 4) estimates, camera_from_object [m].
+        truth: (*, 4, 4).
+        symmetries: (S, 4, 4) object_from_object, the identity among them.
+
+    Returns:
+        (*, S', 4, 4).
+    """
+    symmetries = symmetries.to(truth)
+    if not is_ball(symmetries):
+        return truth[..., None, :, :] @ symmetries
+    # the center is where each rotation leaves it: (I - R) c = t, least squares
+    R, t = rotation_of(symmetries), translation_of(symmetries)
+    center = torch.linalg.pinv((torch.eye(3).to(R) - R).flatten(0, 1)) @ t.flatten()
+    return pose_about(rotation_of(poses), origin_of(truth, center), center)[..., None, :, :]
 
 
 def gather_copies(

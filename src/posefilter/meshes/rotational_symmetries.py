@@ -63,7 +63,8 @@ def make_group(turns: Sequence[RotationalSymmetry], size: float, steps: int = 36
     Args:
         turns: What `select` returns.
         size: The object's diameter [m].
-        steps: Turns that a continuous symmetry is cut into.
+        steps: Turns that a continuous symmetry is cut into; of two, `steps` squared rotations are
+            returned, evenly spread.
 
     Returns:
         (S, 4, 4) object_from_object [m], the identity first.

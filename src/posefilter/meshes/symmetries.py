@@ -1,6 +1,7 @@
 """Symmetries of objects: declared transforms that change nothing one can see."""
 
 from functools import partial
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -9,11 +10,12 @@ import torch
 from posefilter.errors import UserError
 from posefilter.geometry.pose import is_rigid
 from posefilter.geometry.rigid import rigid
-from posefilter.geometry.rotation import exp_so3
+from posefilter.geometry.rotation import exp_so3, spread_rotations
 from posefilter.limits import read_json
 
 MOST = 10_000  # symmetries of an object
 _MOST_BYTES = 1 << 24  # of a file of them
+_PARALLEL = np.cos(np.deg2rad(10.0))
 
 
 def symmetry_group(
@@ -24,23 +26,39 @@ def symmetry_group(
     """Return every product of discrete symmetries and steps about continuous axes.  -> (S, 4, 4),
     the identity first.
 
+    Turns about two axes that cross make all rotations: then it is `steps` squared of these, evenly
+    spread, about the point where the axes meet.
+
     `discrete`: (4, 4) each, as BOP lists them (all but the identity). `continuous`: (axis, a point
     on it [m]) each, cut into `steps` equal turns.
 
     Raises:
         ValueError: They are more than `MOST`, or an axis has no direction.
     """
-    group = [np.eye(4), *(discrete or [])]
-    if len(group) * steps ** len(continuous or []) > MOST:
-        raise ValueError(f"more than {MOST:,} symmetries")
+    group, lines = [np.eye(4), *(discrete or [])], []
     for axis, offset in continuous or []:
         length = float(np.linalg.norm(axis))
         if not (np.isfinite(length) and length > 0):
             raise ValueError(f"an axis of length {length:g}")
-        unit = np.asarray(axis, dtype=np.float64) / length
-        turns = [rotation_about(unit, 2 * np.pi * k / steps, offset) for k in range(steps)]
-        group = [a @ b for a in group for b in turns]
+        lines.append((np.asarray(axis, dtype=np.float64) / length, offset))
+    crossing = any(abs(a @ b) < _PARALLEL for (a, _), (b, _) in pairwise(lines))
+    if (steps**2 if crossing else len(group) * steps ** len(lines)) > MOST:
+        raise ValueError(f"more than {MOST:,} symmetries")
+    if crossing:
+        center = _meet(lines)
+        turns = [np.eye(3), *spread_rotations(steps**2 - 1).numpy()]
+        return np.stack([rigid(turn, center - turn @ center) for turn in turns])
+    for axis, offset in lines:
+        about = [rotation_about(axis, 2 * np.pi * k / steps, offset) for k in range(steps)]
+        group = [a @ b for a in group for b in about]
     return np.stack(group)
+
+
+def _meet(lines: list[tuple[np.ndarray, np.ndarray]]) -> np.ndarray:
+    """Return the point that is nearest to all lines (unit axis, point), least squares.  -> (3,)."""
+    across = [np.eye(3) - np.outer(axis, axis) for axis, _ in lines]
+    right = [P @ point for P, (_, point) in zip(across, lines, strict=True)]
+    return np.linalg.solve(np.sum(across, axis=0), np.sum(right, axis=0))
 
 
 def rotation_about(axis: np.ndarray, angle: float, point: np.ndarray) -> np.ndarray:

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from posefilter.geometry.camera import project
 from posefilter.geometry.pose import transform
-from posefilter.geometry.symmetries import densify
+from posefilter.geometry.symmetries import densify, list_equivalent
 from posefilter.metrics.collect import Rows, concat_state
 from posefilter.metrics.scores import median
 from posefilter.types import ObjectModel
@@ -70,12 +70,12 @@ def _least_of_greatest(
 ) -> Tensor:
     """Return min over symmetries of max over points of the distance in a view of camera points."""
     lead = poses.shape[:-2]
-    points, symmetries = points.to(poses), symmetries.to(poses)
+    points = points.to(poses)
     out = poses.new_zeros(lead.numel())
     pairs = zip(poses.reshape(-1, 4, 4), truth.to(poses).reshape(-1, 4, 4), strict=True)
     for row, (pose, true) in enumerate(pairs):
         guess = view(transform(pose, points), row)
-        same = view(transform(true @ symmetries, points), row)
+        same = view(transform(list_equivalent(pose, true, symmetries), points), row)
         out[row] = (same - guess).norm(dim=-1).amax(-1).amin(0)
     return out.view(lead)
 

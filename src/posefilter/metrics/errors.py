@@ -6,6 +6,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from posefilter.geometry.pose import invert, rotation_of, transform, translation_of
+from posefilter.geometry.symmetries import list_equivalent
 
 _CHUNK = 1 << 20  # points held at once
 _EXACT, _SOME = 16, 256  # equivalent poses that all points measure, and points that choose them
@@ -33,7 +34,7 @@ def add_up_to_symmetry(poses: Tensor, truth: Tensor, points: Tensor, symmetries:
     """Return the least ADD to any of the poses that the object's symmetries make of the truth.
 
     A continuous symmetry has hundreds of them: the exact error is of the sixteen that are least by
-    some of the points.
+    some of the points. Of a ball it is the distance of the centers.
 
     Args:
         poses: (B, 4, 4) camera_from_object [m].
@@ -44,8 +45,8 @@ def add_up_to_symmetry(poses: Tensor, truth: Tensor, points: Tensor, symmetries:
     Returns:
         (B,) [m].
     """
-    equal = truth[:, None] @ symmetries.to(truth)
-    if len(symmetries) > _EXACT:
+    equal = list_equivalent(poses, truth, symmetries)
+    if equal.shape[1] > _EXACT:
         some = points[:: 1 + len(points) // _SOME]
         _, likely = add(poses[:, None], equal, some).topk(_EXACT, dim=1, largest=False)
         equal = equal.gather(1, likely[..., None, None].expand(-1, -1, 4, 4))
