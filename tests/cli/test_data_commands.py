@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from omegaconf import OmegaConf
+from tests.data.dataset_trees import bop_scene, pose, write_mesh
 
 from posefilter.cli.build import build_data
 from posefilter.cli.check_data import check_data
@@ -109,6 +110,30 @@ def test_the_next_commands_of_few_frames_run(
     data.setup()
     assert [len(data.records(name)) for name in ("train", "val", "test")] == [8, 1, 1]
     assert "scores will flatter" in caplog.text
+
+
+def test_the_next_command_reads_the_data_as_the_check_has(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Without the reader's options it would not find the split, or learn inverted poses."""
+    truth, other = pose(), np.linalg.inv(pose())
+    inverse = {"obj_id": 2, "cam_R_m2c": other[:3, :3].ravel().tolist()}
+    inverse["cam_t_m2c"] = (1000 * other[:3, 3]).tolist()
+    for scene in range(3):
+        folder = tmp_path / "bop" / "train_own" / f"{scene:06d}"
+        bop_scene(folder, [[(2, truth)]])
+        (folder / "scene_gt.json").write_text(json.dumps({"0": [inverse]}))
+    mesh = write_mesh(tmp_path / "meshes", "toy") / "toy" / "google_16k" / "textured.obj"
+    mesh.rename(tmp_path / "meshes" / "obj_000002.obj")
+    typed = ["data=bop", f"data.root={tmp_path / 'bop'}", "data.options.split=train_own"]
+    typed += ["data.options.inverted=true", f"meshes={tmp_path / 'meshes'}", "mesh_scale=1"]
+    check_data(compose_job("check_data", CONF, [*typed, "console=json"], tmp_path / "check"))
+    (following,) = json.loads(capsys.readouterr().out)["next"]
+    words = shlex.split(following)
+    assert words[:2] == ["python", "train.py"]
+    data = build_data(compose_job("train", CONF, words[2:], tmp_path).cfg.data, "json")
+    data.setup()
+    np.testing.assert_allclose(data.train_dataset.sample(0).camera_from_object, truth, atol=1e-6)
 
 
 def test_one_frame_can_be_generated(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
