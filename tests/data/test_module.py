@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import multiprocessing
+import os
 import subprocess
 import sys
 import textwrap
@@ -289,6 +290,25 @@ def test_the_disk_cache_is_renewed_when_the_camera_the_meshes_or_their_unit_chan
     faces = (" ".join(line) for line in lines if line[0] == "f")
     mesh.write_text("\n".join([*bigger, *faces]) + "\n")
     assert read()[0] < 0.5 * first[0]
+
+
+def test_the_disk_cache_is_renewed_when_the_unit_of_the_depth_changes(tmp_path):
+    """A depth scale that was mended would else have no effect."""
+    bop_scene(tmp_path / "data" / "000000", [[(2, pose())]], depth_scale=0.25)
+    camera = tmp_path / "data" / "000000" / "scene_camera.json"
+    before, kept = camera.read_text(), camera.stat()
+
+    def read():
+        split = {"test": 1.0}
+        data = PoseDataModule("bop", tmp_path / "data", "obj_000002", split=split, cache="disk")
+        return data.test_dataset.sample(0).depth
+
+    first = read()
+    camera.write_text(before.replace("0.25", "0.125"))
+    np.testing.assert_allclose(read(), first / 2, atol=1e-4)
+    camera.write_text(before)
+    os.utime(camera, ns=(kept.st_atime_ns, kept.st_mtime_ns))  # as a file that is put back has it
+    np.testing.assert_array_equal(read(), first)
 
 
 def test_visibility_filters_training_and_test_apart(tmp_path):
