@@ -502,6 +502,9 @@ def test_object_models_and_published_points(root, tmp_path):
     np.savetxt(tmp_path / "toy" / "points.xyz", points @ native[:3, :3].T + native[:3, 3])
     published = module(root, split={"test": 1.0}, model_points_dir=tmp_path).object_model(0).points
     np.testing.assert_allclose(published, points, atol=1e-6)
+    np.savetxt(tmp_path / "toy" / "points.xyz", 1000 * points)
+    with pytest.raises(UserError, match=r"326 m across, .* 0\.182 m; they should be in meters"):
+        module(root, model_points_dir=tmp_path).object_model(0)
     with pytest.raises(UserError, match=r"no toy/points\.xyz"):
         module(root, model_points_dir=tmp_path / "none").object_model(0)
 
