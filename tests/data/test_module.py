@@ -332,6 +332,21 @@ def test_visibility_filters_training_and_test_apart(tmp_path):
     assert dm.describe()["splits"]["train"]["left_out"] == {"visibility below 0.9": 2}
 
 
+def test_objects_whose_depth_is_not_kept_are_left_out_and_counted(tmp_path):
+    """The depth of each of their pixels would be unknown."""
+    near, far = pose(position=(0, 0, 0.5)), pose(position=(0, 0, 7.0))
+    camera = K * [[12.0], [12.0], [1.0]]
+    camera[:2, 2] = K[:2, 2]
+    folder = tmp_path / "data" / "000000"
+    bop_scene(folder, [[(2, near)], [(2, far)]])
+    mask = (truth(far, camera) > 0).astype(np.uint8) * 255
+    assert cv2.imwrite(str(folder / "mask_visib" / "000001_000000.png"), mask)
+    data = PoseDataModule("bop", tmp_path / "data", "obj_000002", split={"test": 1.0})
+    assert [record.im_id for record in data.records("test")] == [0]
+    (left_out,) = data.describe()["splits"]["test"]["left_out"].items()
+    assert left_out == ("the object is beyond 6.55 m, where depth is not kept", 1)
+
+
 def test_smaller_limits_take_a_part_of_larger_ones(root):
     names = {}
     for limit in (2, 5, 9):

@@ -1,8 +1,8 @@
 """Keep decoded, resized frames, so that training waits for no decoder: in memory, on disk, or not
 at all.
 
-Color stays 8-bit, depth becomes 16-bit (0.1 mm a unit; beyond 6.5535 m it counts as unknown), masks
-become bits.
+Color stays 8-bit, depth becomes 16-bit (0.1 mm a unit; beyond `FARTHEST` it counts as unknown),
+masks become bits.
 """
 
 import hashlib
@@ -22,6 +22,7 @@ from posefilter.paths import check_inside
 CACHES = ("memory", "disk", "none")
 _HEADER = 4096  # bytes, at most, ahead of an array
 _UNITS = 10_000.0  # a meter
+FARTHEST = 65535 / _UNITS  # [m] depth that is kept
 # of the files of a `DiskCache`: one more whenever they change, so that none of another layout is
 # read
 _LAYOUT = 4
