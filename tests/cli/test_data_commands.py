@@ -12,9 +12,11 @@ from tests.data.dataset_trees import bop_scene, pose, write_mesh
 from posefilter.cli.build import build_data
 from posefilter.cli.check_data import check_data
 from posefilter.cli.command import FAILURE, compose_job, run_command
+from posefilter.cli.console import setting
 from posefilter.cli.evaluate import data_settings
 from posefilter.cli.generate import generate
 from posefilter.cli.plain import to_plain
+from posefilter.cli.train import places
 from posefilter.errors import ProblemsFound, UserError
 
 HOME = Path(__file__).parents[2]
@@ -134,6 +136,26 @@ def test_the_next_command_reads_the_data_as_the_check_has(
     data = build_data(compose_job("train", CONF, words[2:], tmp_path).cfg.data, "json")
     data.setup()
     np.testing.assert_allclose(data.train_dataset.sample(0).camera_from_object, truth, atol=1e-6)
+
+
+def test_an_evaluation_is_told_what_no_checkpoint_decides(tmp_path: Path) -> None:
+    """Lists of frames elsewhere, and that frames are kept on disk; it would be refused."""
+    (tmp_path / "data").mkdir()
+    typed = ["data=ycb_video", f"data.root={tmp_path / 'data'}", "data.cache=disk"]
+    typed += [f"data.options.frames={tmp_path / 'own.txt'}"]
+    typed += [f"data.split={{test: {tmp_path / 'held.txt'}, train: 0.9, val: 0.1}}"]
+    job = compose_job("train", CONF, typed, tmp_path)
+    trained = {"data": {**to_plain(job.cfg.data), "augment": {}}, "seed": 0}
+    words = [setting(key.replace("__", "."), value) for key, value in places(job).items()]
+    assert len(words) == 4
+    given = [f"++{shlex.split(word)[0]}" for word in words]
+    told = data_settings(compose_job("evaluate", CONF, given, tmp_path), trained, None)
+    assert told.options.frames == str(tmp_path / "own.txt")
+    assert told.split == {"train": 0.9, "val": 0.1, "test": str(tmp_path / "held.txt")}
+    for left_out in given:
+        rest = [word for word in given if word != left_out]
+        with pytest.raises(UserError, match=r"data\.(root|cache|options\.frames|split\.test)="):
+            data_settings(compose_job("evaluate", CONF, rest, tmp_path), trained, None)
 
 
 def test_one_frame_can_be_generated(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
