@@ -128,6 +128,8 @@ def test_broken_masks_and_folders(tmp_path):
     bop_scene(tmp_path / "data" / "train_pbr" / "000001", [[(2, pose())]])
     with pytest.raises(UserError, match=r"no BOP scenes.*data\.options\.split=train_pbr\)"):
         BopReader(tmp_path / "data")
+    with pytest.raises(UserError, match=r"val: no such folder .*data\.options\.split=train_pbr\)"):
+        BopReader(tmp_path / "data", split="val")
     with pytest.raises(UserError, match="unknown class 'obj_000003'"):
         BopReader(tmp_path, "obj_000003")
 

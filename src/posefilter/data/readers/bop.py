@@ -90,12 +90,14 @@ class BopReader(BaseReader):
         need_text("split", split)
         self._inverted = inverted
         base = self.root / split if split else self.root
-        folders = sorted(_scene_folders(base))
+        missing = self.root.is_dir() and not base.is_dir()
+        folders = [] if missing else sorted(_scene_folders(base))
         if not folders:
-            splits = sorted({path.parts[-3] for path in base.glob("*/*/scene_gt.json")})
+            home = self.root if missing else base
+            splits = sorted({path.parts[-3] for path in home.glob("*/*/scene_gt.json")})
+            why = "no such folder" if missing else "no BOP scenes here: no <scene>/scene_gt.json"
             raise UserError(
-                f"{base}: no BOP scenes here: no <scene>/scene_gt.json (data.root, "
-                f"data.options.split={'|'.join(splits) or '...'})"
+                f"{base}: {why} (data.root, data.options.split={'|'.join(splits) or '...'})"
             )
         if not any((folder / "scene_gt.json").exists() for folder in folders):
             raise UserError(
