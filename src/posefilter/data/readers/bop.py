@@ -2,6 +2,7 @@
 
 import re
 from collections.abc import Iterable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -296,3 +297,14 @@ def _scene_folders(base: Path) -> Iterator[Path]:
     for name in list_folder(base):
         if _SCENE.fullmatch(name) and (base / name).is_dir():
             yield base / name
+        elif _is_file(base / name / "scene_gt.json"):
+            raise UserError(
+                f"{base / name}: scenes are named by numbers, such as 000001; rename it, or move "
+                "it out of the dataset"
+            )
+
+
+def _is_file(path: Path) -> bool:
+    with suppress(OSError):  # its folder may not be read, and need not
+        return path.is_file()
+    return False

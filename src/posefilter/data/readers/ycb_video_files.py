@@ -69,7 +69,10 @@ def list_scenes(root: Path, subsets: set[str]) -> Iterator[tuple[str, Path]]:
             if FRAME.fullmatch(name):
                 yield name, data / name
             elif _holds_frames(data / name):
-                raise UserError(f"{data / name}: scenes are named by numbers, such as 0001")
+                raise UserError(
+                    f"{data / name}: scenes are named by numbers, such as 0001; rename it, or move "
+                    "it out of the dataset"
+                )
 
 
 def _holds_frames(folder: Path) -> bool:
