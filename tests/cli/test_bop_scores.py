@@ -1,6 +1,7 @@
 """Results of several instances, scored by the command: the true poses and what is made of them."""
 
 import json
+import math
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +15,7 @@ from posefilter.data.readers.registry import open_reader
 from posefilter.meshes.store import MeshStore
 from posefilter.metrics.bop_results import PoseRow, to_native, write_poses_csv
 from posefilter.metrics.bop_targets import Target
+from posefilter.metrics.image_errors import FILE, read_errors
 from posefilter.synthetic.generate import generate
 
 
@@ -82,6 +84,22 @@ def test_each_instance_is_scored_by_the_estimate_that_is_nearest(
     assert missed["bop"]["ar_mssd"] == pytest.approx(50, abs=10)
     assert missed["bop"]["estimates"] == 4  # as many of an image as there are instances
     assert missed["add"]["recall_01d"] == pytest.approx(50)
+
+
+def test_the_table_of_errors_has_each_number_in_its_column(scenes: Path, tmp_path: Path) -> None:
+    rows = [one._replace(seconds=0.25) for one in list_truths(scenes)[:3]]
+    rows[0].camera_from_native[2, 3] += 0.01
+    evaluate(rows, scenes, tmp_path / "one")
+    table = read_errors(tmp_path / "one" / "scores" / FILE)
+    assert sorted(row.add_mm for row in table) == pytest.approx([0, 0, 10, math.inf], abs=0.01)
+    for row in table:
+        known = math.isfinite(row.add_mm)
+        assert row.add_up_to_symmetry_mm == row.add_mm  # it has no symmetries
+        assert math.isnan(row.score) != known
+        assert not known or row.score == pytest.approx(0.55, abs=0.06)
+        assert not known or row.seconds == 0.25
+        for name in ("particles_on_object", "presence", "probability", "credible_rank"):
+            assert math.isnan(getattr(row, name))
 
 
 def test_a_file_of_targets_says_how_many_count(scenes: Path, tmp_path: Path) -> None:

@@ -7,13 +7,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 from omegaconf import OmegaConf
+from tests.data.dataset_trees import bop_scene, pose, write_mesh
 
 from posefilter.cli.build import build_data
 from posefilter.cli.check_data import check_data
 from posefilter.cli.command import FAILURE, compose_job, run_command
+from posefilter.cli.console import setting
 from posefilter.cli.evaluate import data_settings
 from posefilter.cli.generate import generate
 from posefilter.cli.plain import to_plain
+from posefilter.cli.train import places
 from posefilter.errors import ProblemsFound, UserError
 
 HOME = Path(__file__).parents[2]
@@ -109,6 +112,50 @@ def test_the_next_commands_of_few_frames_run(
     data.setup()
     assert [len(data.records(name)) for name in ("train", "val", "test")] == [8, 1, 1]
     assert "scores will flatter" in caplog.text
+
+
+def test_the_next_command_reads_the_data_as_the_check_has(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Without the reader's options it would not find the split, or learn inverted poses."""
+    truth, other = pose(), np.linalg.inv(pose())
+    inverse = {"obj_id": 2, "cam_R_m2c": other[:3, :3].ravel().tolist()}
+    inverse["cam_t_m2c"] = (1000 * other[:3, 3]).tolist()
+    for scene in range(3):
+        folder = tmp_path / "bop" / "train_own" / f"{scene:06d}"
+        bop_scene(folder, [[(2, truth)]])
+        (folder / "scene_gt.json").write_text(json.dumps({"0": [inverse]}))
+    mesh = write_mesh(tmp_path / "meshes", "toy") / "toy" / "google_16k" / "textured.obj"
+    mesh.rename(tmp_path / "meshes" / "obj_000002.obj")
+    typed = ["data=bop", f"data.root={tmp_path / 'bop'}", "data.options.split=train_own"]
+    typed += ["data.options.inverted=true", f"meshes={tmp_path / 'meshes'}", "mesh_scale=1"]
+    check_data(compose_job("check_data", CONF, [*typed, "console=json"], tmp_path / "check"))
+    (following,) = json.loads(capsys.readouterr().out)["next"]
+    words = shlex.split(following)
+    assert words[:2] == ["python", "train.py"]
+    data = build_data(compose_job("train", CONF, words[2:], tmp_path).cfg.data, "json")
+    data.setup()
+    np.testing.assert_allclose(data.train_dataset.sample(0).camera_from_object, truth, atol=1e-6)
+
+
+def test_an_evaluation_is_told_what_no_checkpoint_decides(tmp_path: Path) -> None:
+    """Lists of frames elsewhere, and that frames are kept on disk; it would be refused."""
+    (tmp_path / "data").mkdir()
+    typed = ["data=ycb_video", f"data.root={tmp_path / 'data'}", "data.cache=disk"]
+    typed += [f"data.options.frames={tmp_path / 'own.txt'}"]
+    typed += [f"data.split={{test: {tmp_path / 'held.txt'}, train: 0.9, val: 0.1}}"]
+    job = compose_job("train", CONF, typed, tmp_path)
+    trained = {"data": {**to_plain(job.cfg.data), "augment": {}}, "seed": 0}
+    words = [setting(key.replace("__", "."), value) for key, value in places(job).items()]
+    assert len(words) == 4
+    given = [f"++{shlex.split(word)[0]}" for word in words]
+    told = data_settings(compose_job("evaluate", CONF, given, tmp_path), trained, None)
+    assert told.options.frames == str(tmp_path / "own.txt")
+    assert told.split == {"train": 0.9, "val": 0.1, "test": str(tmp_path / "held.txt")}
+    for left_out in given:
+        rest = [word for word in given if word != left_out]
+        with pytest.raises(UserError, match=r"data\.(root|cache|options\.frames|split\.test)="):
+            data_settings(compose_job("evaluate", CONF, rest, tmp_path), trained, None)
 
 
 def test_one_frame_can_be_generated(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

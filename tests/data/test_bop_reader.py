@@ -128,6 +128,8 @@ def test_broken_masks_and_folders(tmp_path):
     bop_scene(tmp_path / "data" / "train_pbr" / "000001", [[(2, pose())]])
     with pytest.raises(UserError, match=r"no BOP scenes.*data\.options\.split=train_pbr\)"):
         BopReader(tmp_path / "data")
+    with pytest.raises(UserError, match=r"val: no such folder .*data\.options\.split=train_pbr\)"):
+        BopReader(tmp_path / "data", split="val")
     with pytest.raises(UserError, match="unknown class 'obj_000003'"):
         BopReader(tmp_path, "obj_000003")
 
@@ -250,3 +252,12 @@ def test_a_list_for_detection_selects_whole_images(tmp_path):
     (tmp_path / "list.json").write_text('[{"scene_id": 1}]')
     with pytest.raises(UserError, match="not a list of BOP targets"):
         split_records(records, {"test": "list.json"}, 0, tmp_path)
+
+
+def test_a_scene_that_is_not_numbered_is_not_left_out_without_a_word(tmp_path):
+    for name in ("000001", "kitchen"):
+        bop_scene(tmp_path / name, [[(2, pose())]])
+    with pytest.raises(UserError, match=r"kitchen: scenes are named by numbers, such as 000001"):
+        BopReader(tmp_path)
+    (tmp_path / "kitchen").rename(tmp_path / "2")
+    assert [record.scene_id for record in BopReader(tmp_path).records()] == [1, 2]

@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import multiprocessing
+import os
 import subprocess
 import sys
 import textwrap
@@ -291,6 +292,25 @@ def test_the_disk_cache_is_renewed_when_the_camera_the_meshes_or_their_unit_chan
     assert read()[0] < 0.5 * first[0]
 
 
+def test_the_disk_cache_is_renewed_when_the_unit_of_the_depth_changes(tmp_path):
+    """A depth scale that was mended would else have no effect."""
+    bop_scene(tmp_path / "data" / "000000", [[(2, pose())]], depth_scale=0.25)
+    camera = tmp_path / "data" / "000000" / "scene_camera.json"
+    before, kept = camera.read_text(), camera.stat()
+
+    def read():
+        split = {"test": 1.0}
+        data = PoseDataModule("bop", tmp_path / "data", "obj_000002", split=split, cache="disk")
+        return data.test_dataset.sample(0).depth
+
+    first = read()
+    camera.write_text(before.replace("0.25", "0.125"))
+    np.testing.assert_allclose(read(), first / 2, atol=1e-4)
+    camera.write_text(before)
+    os.utime(camera, ns=(kept.st_atime_ns, kept.st_mtime_ns))  # as a file that is put back has it
+    np.testing.assert_array_equal(read(), first)
+
+
 def test_visibility_filters_training_and_test_apart(tmp_path):
     write_mesh(tmp_path / "meshes", "toy")
     front = pose((0.1, 0.2, 0.3), (0.04, -0.02, 0.33))
@@ -310,6 +330,21 @@ def test_visibility_filters_training_and_test_apart(tmp_path):
     assert [r.name[-11:] for r in dm.records("train")] == ["000000.left"] * 2
     assert len(dm.records("test")) == 4
     assert dm.describe()["splits"]["train"]["left_out"] == {"visibility below 0.9": 2}
+
+
+def test_objects_whose_depth_is_not_kept_are_left_out_and_counted(tmp_path):
+    """The depth of each of their pixels would be unknown."""
+    near, far = pose(position=(0, 0, 0.5)), pose(position=(0, 0, 7.0))
+    camera = K * [[12.0], [12.0], [1.0]]
+    camera[:2, 2] = K[:2, 2]
+    folder = tmp_path / "data" / "000000"
+    bop_scene(folder, [[(2, near)], [(2, far)]])
+    mask = (truth(far, camera) > 0).astype(np.uint8) * 255
+    assert cv2.imwrite(str(folder / "mask_visib" / "000001_000000.png"), mask)
+    data = PoseDataModule("bop", tmp_path / "data", "obj_000002", split={"test": 1.0})
+    assert [record.im_id for record in data.records("test")] == [0]
+    (left_out,) = data.describe()["splits"]["test"]["left_out"].items()
+    assert left_out == ("the object is beyond 6.55 m, where depth is not kept", 1)
 
 
 def test_smaller_limits_take_a_part_of_larger_ones(root):
@@ -482,6 +517,9 @@ def test_object_models_and_published_points(root, tmp_path):
     np.savetxt(tmp_path / "toy" / "points.xyz", points @ native[:3, :3].T + native[:3, 3])
     published = module(root, split={"test": 1.0}, model_points_dir=tmp_path).object_model(0).points
     np.testing.assert_allclose(published, points, atol=1e-6)
+    np.savetxt(tmp_path / "toy" / "points.xyz", 1000 * points)
+    with pytest.raises(UserError, match=r"326 m across, .* 0\.182 m; they should be in meters"):
+        module(root, model_points_dir=tmp_path).object_model(0)
     with pytest.raises(UserError, match=r"no toy/points\.xyz"):
         module(root, model_points_dir=tmp_path / "none").object_model(0)
 

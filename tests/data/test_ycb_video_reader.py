@@ -165,3 +165,16 @@ def test_broken_files_are_named(tmp_path):
     meta.write_bytes(meta.read_bytes()[:200])
     with pytest.raises(BadData, match=r"000001-meta\.mat: (not readable|missing key)"):
         YCBVideoReader(tmp_path, NAME)
+
+
+def test_a_scene_that_is_not_numbered_is_not_left_out_without_a_word(tmp_path):
+    for scene in ("0001", "kitchen"):
+        (tmp_path / "data" / scene).mkdir(parents=True)
+        ycb_frame(tmp_path / "data" / scene / "000001", [(1, pose())], np.eye(4))
+    (tmp_path / "data" / "notes").mkdir()
+    with pytest.raises(UserError, match=r"kitchen: scenes are named by numbers, such as 0001"):
+        YCBVideoReader(tmp_path, mesh_frame="ycb_video")
+    one = YCBVideoReader(tmp_path / "data" / "kitchen", mesh_frame="ycb_video")  # asked for
+    assert [record.name for record in one.records()] == ["kitchen/000001"]
+    (tmp_path / "data" / "kitchen").rename(tmp_path / "data" / "0002")
+    assert len(YCBVideoReader(tmp_path, mesh_frame="ycb_video").records()) == 2

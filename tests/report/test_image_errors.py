@@ -17,6 +17,7 @@ from posefilter.report.blocks import Text
 from posefilter.report.comparison_page import (
     judge,
     list_settings,
+    list_verdict,
     make_comparison_page,
     match_images,
     read_two_runs,
@@ -190,6 +191,18 @@ def test_a_run_against_itself_differs_in_nothing_and_noise_by_chance() -> None:
     assert judge(both).chance > 0.05
     missed = match_images([make_row(0, math.inf)], [make_row(0, math.inf)])
     assert judge(missed)[:3] == (0, 0, 1)
+
+
+def test_a_turn_that_is_a_symmetry_decides_nothing() -> None:
+    """By ADD, the first would be far ahead."""
+    first = [make_row(i, 5.0)._replace(add_up_to_symmetry_mm=5.0) for i in range(20)]
+    turned = [make_row(i, 90.0)._replace(add_up_to_symmetry_mm=4.0) for i in range(20)]
+    both = match_images(first, turned)
+    assert judge(both)[:3] == (0, 20, 0)
+    assert "by ADD up to symmetry" in str(list_verdict(both, ("A", "B")))
+    earlier = match_images([make_row(i, 5.0) for i in range(20)], turned)
+    assert judge(earlier)[:3] == (20, 0, 0)
+    assert "by ADD:" in str(list_verdict(earlier, ("A", "B")))
 
 
 def test_the_comparison_page(pair: tuple[Path, Path]) -> None:

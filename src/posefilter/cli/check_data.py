@@ -1,10 +1,10 @@
 """Tell whether a dataset fits its meshes."""
 
+import re
+import shlex
 from collections import Counter
 from pathlib import Path
 from typing import Any
-
-from omegaconf import DictConfig
 
 from posefilter.checking.check import check_dataset, format_report
 from posefilter.cli.console import JSON, ended, typed
@@ -40,27 +40,29 @@ def check_data(job: Job) -> None:
     if not report["problems"]:
         images = Counter(record.object for record in reader.records())
         names = (row["object"] for row in report["objects"])
-        following = [train_on(cfg, name, images[name]) for name in names]
+        following = [train_on(job, name, images[name]) for name in names]
     ended(cfg.console, "checked", files, following, **report)
     if report["problems"]:
         many = len(report["problems"])
         raise ProblemsFound(f"{cfg.data.root}: {many} problem{'s' * (many != 1)}; see {file}")
 
 
-def train_on(cfg: DictConfig, name: str, images: int) -> str:
-    """Return the command that trains on an object of the data.
+def train_on(job: Job, name: str, images: int) -> str:
+    """Return the command that trains on an object of the data, read as the check has read them.
 
     Args:
-        cfg: The check's settings.
+        job: The check.
         name: The object.
         images: How many images show it.
     """
+    data = job.cfg.data
+    options = [one for one in job.overrides if re.match(r"[+~]*data\.options\b", one)]
     # what train.py takes by default
-    rendered = cfg.data.source == "fat" and (Path(cfg.data.root) / GENERATOR).is_file()
-    more: dict[str, Any] = {} if rendered else {"data": cfg.data.source}
-    more |= {"data__root": cfg.data.root, "data__object": name, "data__meshes": cfg.data.meshes}
-    if cfg.data.mesh_scale is not None:
-        more["data__mesh_scale"] = cfg.data.mesh_scale
+    rendered = data.source == "fat" and (Path(data.root) / GENERATOR).is_file() and not options
+    more: dict[str, Any] = {} if rendered else {"data": job.choices.get("data", data.source)}
+    more |= {"data__root": data.root, "data__object": name, "data__meshes": data.meshes}
+    if data.mesh_scale is not None:
+        more["data__mesh_scale"] = data.mesh_scale
     if images < _FEW_IMAGES:  # the one image of a part may show little of the object
         more |= {"data__min_visibility": 0.0, "data__min_visibility_test": 0.0}
-    return typed("train", **more)
+    return " ".join([typed("train", **more), *map(shlex.quote, options)])

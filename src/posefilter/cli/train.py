@@ -259,16 +259,19 @@ def finish(
 
 
 def places(job: Job) -> dict[str, Any]:
-    """Return the folders that an evaluation is to be told: outside of the working folder no
-    checkpoint decides on any.
+    """Return the folders and files that an evaluation is to be told, and whether frames are kept on
+    disk: outside of the working folder no checkpoint decides on any place.
     """
-    folders = ("root", "meshes", "cache_dir", "model_points_dir")
-    named = {key: job.cfg.data.get(key) for key in folders}
-    return {
+    data = job.cfg.data
+    named = {key: data.get(key) for key in ("root", "meshes", "cache_dir", "model_points_dir")}
+    for group in ("options", "split"):  # lists of frames
+        named |= {f"{group}.{key}": value for key, value in (data.get(group) or {}).items()}
+    told = {
         f"data__{key}": value
         for key, value in named.items()
-        if value and not stays_inside(str(value), Path())
+        if isinstance(value, str) and not stays_inside(value, Path())
     }
+    return told | ({"data__cache": "disk"} if data.get("cache") == "disk" else {})
 
 
 def plugins(job: Job) -> dict[str, Any]:

@@ -1,8 +1,8 @@
 """Keep decoded, resized frames, so that training waits for no decoder: in memory, on disk, or not
 at all.
 
-Color stays 8-bit, depth becomes 16-bit (0.1 mm a unit; beyond 6.5535 m it counts as unknown), masks
-become bits.
+Color stays 8-bit, depth becomes 16-bit (0.1 mm a unit; beyond `FARTHEST` it counts as unknown),
+masks become bits.
 """
 
 import hashlib
@@ -22,9 +22,10 @@ from posefilter.paths import check_inside
 CACHES = ("memory", "disk", "none")
 _HEADER = 4096  # bytes, at most, ahead of an array
 _UNITS = 10_000.0  # a meter
+FARTHEST = 65535 / _UNITS  # [m] depth that is kept
 # of the files of a `DiskCache`: one more whenever they change, so that none of another layout is
 # read
-_LAYOUT = 3
+_LAYOUT = 4
 _STALE = 3600.0  # [s] after which a file that is not whole has no writer any more
 
 
@@ -70,8 +71,9 @@ class MemoryCache:
 class DiskCache:
     """Keep frames in a folder, one file an image and one a record, for this and later runs.
 
-    A file is written whole or not at all, and is out of date as soon as a source file's size or
-    time of change differs.
+    A file is written whole or not at all. A record's is out of date as soon as a source file's size
+    or time of change differs; an image's is named by its content, since the depth's unit may be in
+    any of the source files, and records of one image share it.
     """
 
     def __init__(self, folder: Path, version: str) -> None:
@@ -92,38 +94,45 @@ class DiskCache:
                 f"data.cache=memory"
             ) from error
         self._records: dict[str, Prepared] = {}
+        self._images: dict[str, Path] = {}  # by the record's key
 
     def find(self, record: FrameRecord) -> Prepared | None:
         """Return what is kept of a record, None where a source file has changed."""
         if record.key not in self._records:
-            path = self._path(record.key, _stamp(record), ".npz")
-            if not (path.is_file() and self._image_path(record).is_file()):
+            path = self._record_path(record)
+            if not path.is_file():
                 return None
             try:
-                self._records[record.key] = _read_prepared(path)
+                one, digest = _read_prepared(path)
             # a damaged archive, a header that lies of its array: their readers raise anything
             except Exception as error:
                 raise self._damaged(path) from error
+            image = self._image_path(digest)
+            if not image.is_file():
+                return None
+            self._records[record.key], self._images[record.key] = one, image
         return self._records[record.key]
 
     def keep(self, record: FrameRecord, sample: Sample) -> Prepared:
         """Write a sample."""
-        one = prepare(sample)
-        image = self._image_path(record)
+        one, pixels = prepare(sample), pack_image(sample)
+        digest = hashlib.sha256(pixels.data).digest()
+        image = self._image_path(digest)
         if not image.is_file():
             packed = io.BytesIO()  # into a file, NumPy tells a full disk without its number
-            np.save(packed, pack_image(sample))
+            np.save(packed, pixels)
             write_whole(image, packed.getbuffer())
         parts = {
+            "image": np.frombuffer(digest, np.uint8),
             "mask_bits": one.mask_bits,
             "numbers": np.array([*one.shape, one.object_id]),
             "intrinsics": one.intrinsics,
             "pose": one.camera_from_object,
             "visibility": np.array(one.visibility),
         }
-        with open_whole(self._path(record.key, _stamp(record), ".npz"), sync=False) as file:
+        with open_whole(self._record_path(record), sync=False) as file:
             np.savez(file, allow_pickle=False, **parts)
-        self._records[record.key] = one
+        self._records[record.key], self._images[record.key] = one, image
         return one
 
     def load(self, record: FrameRecord, frame_id: int) -> Sample:
@@ -131,7 +140,7 @@ class DiskCache:
         one = self.find(record)
         if one is None:
             raise UserError(f"{record.files[0]}: changed while it was in use; start again")
-        path, (height, width) = self._image_path(record), one.shape
+        path, (height, width) = self._images[record.key], one.shape
         if path.stat().st_size > 5 * height * width + _HEADER:
             raise self._damaged(path)
         try:
@@ -142,11 +151,15 @@ class DiskCache:
     def _damaged(self, path: Path) -> UserError:
         return UserError(f"{path}: a damaged file of the cache; delete {self.folder}")
 
-    def _image_path(self, record: FrameRecord) -> Path:
-        return self._path(record.name, _stamp(record, 2), ".npy")
+    def _image_path(self, digest: bytes) -> Path:
+        return self._path(digest, ".npy")
 
-    def _path(self, name: str, stamp: str, suffix: str) -> Path:
-        code = hashlib.sha256(f"{name} {stamp}".encode()).hexdigest()[:24]
+    def _record_path(self, record: FrameRecord) -> Path:
+        name = f"{record.key} {stamp_files(record.files)}"
+        return self._path(hashlib.sha256(name.encode()).digest(), ".npz")
+
+    def _path(self, digest: bytes, suffix: str) -> Path:
+        code = digest.hex()[:24]
         return self.folder / code[:2] / f"{code}{suffix}"
 
 
@@ -208,8 +221,8 @@ def unpack(image: np.ndarray, one: Prepared, frame_id: int) -> Sample:
     return Sample(rgb, depth, mask, K, pose, one.object_id, frame_id, one.visibility)
 
 
-def _read_prepared(path: Path) -> Prepared:
-    """Read what was kept of a record.
+def _read_prepared(path: Path) -> tuple[Prepared, bytes]:
+    """Read what was kept of a record, and the digest of its image.
 
     Raises ValueError where the file is larger than what it says.
     """
@@ -222,9 +235,5 @@ def _read_prepared(path: Path) -> Prepared:
         if len(bits) != -(-height * width // 8):
             raise ValueError("its mask is not of the image's size")
         K, pose = kept["intrinsics"], kept["pose"]
-        return Prepared(bits, (height, width), K, pose, object_id, visibility)
-
-
-def _stamp(record: FrameRecord, files: int | None = None) -> str:
-    """Return what changes when a source file does: any of them, or the first two (color, depth)."""
-    return stamp_files(record.files[:files])
+        digest = kept["image"].tobytes()
+        return Prepared(bits, (height, width), K, pose, object_id, visibility), digest

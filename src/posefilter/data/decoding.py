@@ -5,7 +5,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 
-from posefilter.data.cache import FrameCache, Prepared
+from posefilter.data.cache import FARTHEST, FrameCache, Prepared
 from posefilter.data.frames import FrameRecord, NotShown, Sample
 from posefilter.data.readers.base import BaseReader
 from posefilter.data.readers.checked import index_records, read_checked
@@ -74,7 +74,8 @@ class FrameDecoder:
 
         Frames whose visibility is unknown pass; `limit` is how many are enough. Raises UserError
         for the first broken file where `on_error` is "raise". An object that is listed but not in
-        the label is no error: it is left out and counted.
+        the label, or so far away that its depth is not kept, is no error: it is left out and
+        counted.
         """
         chosen: list[FrameRecord] = []
         left_out: Counter[str] = Counter()
@@ -89,6 +90,8 @@ class FrameDecoder:
                 left_out[found.cause] += 1
             elif found.pixels == 0:
                 left_out["the mask vanishes at this image size"] += 1
+            elif found.camera_from_object[2, 3] > FARTHEST:
+                left_out[f"the object is beyond {FARTHEST:.2f} m, where depth is not kept"] += 1
             elif found.visibility < min_visibility:
                 left_out[f"visibility below {min_visibility}"] += 1
             else:

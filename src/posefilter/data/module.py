@@ -199,7 +199,8 @@ class PoseDataModule(LightningDataModule):
 
         Raises:
             UserError: The dataset has photographs, and meshes are the built-in ones; or it says
-                that the object has another diameter than its mesh.
+                that the object has another diameter than its mesh, or brings points of it in
+                another unit.
         """
         name = self.objects[object_id]
         if self.source in ("ycb_video", "bop") and str(self.meshes.root) == BUILTIN:
@@ -207,9 +208,10 @@ class PoseDataModule(LightningDataModule):
                 f"{name}: builtin meshes are not the objects of real photographs; "
                 f"give data.meshes=DIR"
             )
-        native = self.reader.native_from_mesh(name)
-        points = read_model_points(self._model_points_dir, self.root, name, native)
-        found = object_model(self.meshes.load(name), points=points, count=self._num_model_points)
+        mesh, native = self.meshes.load(name), self.reader.native_from_mesh(name)
+        size = float(np.linalg.norm(np.subtract(*mesh.bounds)))
+        points = read_model_points(self._model_points_dir, self.root, name, native, size)
+        found = object_model(mesh, points=points, count=self._num_model_points)
         self.reader.check_diameter(name, found.diameter)
         return found
 

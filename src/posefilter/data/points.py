@@ -9,15 +9,32 @@ from posefilter.geometry.rigid import move
 from posefilter.limits import open_text
 from posefilter.paths import is_plain_name
 
+_FACTOR = 5.0  # by which points in another unit than meters are larger or smaller, at least
+
 
 def read_model_points(
-    folder: str | Path | None, root: Path, name: str, native_from_mesh: np.ndarray
+    folder: str | Path | None,
+    root: Path,
+    name: str,
+    native_from_mesh: np.ndarray,
+    size: float | None = None,
 ) -> np.ndarray | None:
     """Return a class's points in the mesh file's frame, None where the dataset brings none.  -> (P,
     3) [m].
 
     They are looked for in `folder`/<class>/points.xyz, else in `models` beside the dataset, as
     YCB-Video has them.
+
+    Args:
+        folder: Where the points are; None: beside the dataset.
+        root: The dataset's folder.
+        name: The class.
+        native_from_mesh: (4, 4) [m].
+        size: Diagonal of the mesh's bounding box [m]; None: it is not compared with the points'.
+
+    Raises:
+        UserError: There are none in `folder`, or the file holds something else, or points in
+            another unit.
     """
     folders = [Path(folder)] if folder is not None else [root / "models", root.parent / "models"]
     if not is_plain_name(name):
@@ -35,4 +52,10 @@ def read_model_points(
         raise UserError(f"{path}: not rows of three numbers ({error})") from error
     if native.shape[1] != 3 or len(native) < 4 or not np.isfinite(native).all():
         raise UserError(f"{path}: not rows of three numbers (found {native.shape})")
+    own = float(np.linalg.norm(np.ptp(native, axis=0)))
+    if size is not None and not 1 / _FACTOR < own / size < _FACTOR:
+        raise UserError(
+            f"{path}: its points are {own:.3g} m across, and the mesh of {name} is {size:.3g} m; "
+            "they should be in meters"
+        )
     return move(native, np.linalg.inv(native_from_mesh))

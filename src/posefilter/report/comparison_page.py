@@ -42,9 +42,18 @@ class Pair(NamedTuple):
     b: ImageError
 
     @property
+    def errors(self) -> tuple[float, float]:
+        """Return both errors [mm]: ADD up to symmetry, which is ADD where an object has none; ADD
+        where a test of an earlier version has no other.
+        """
+        both = self.a.add_up_to_symmetry_mm, self.b.add_up_to_symmetry_mm
+        return (self.a.add_mm, self.b.add_mm) if any(map(math.isnan, both)) else both
+
+    @property
     def change(self) -> float:
         """Return how much greater the second error is [mm]; 0 where both missed the object."""
-        return 0.0 if self.a.add_mm == self.b.add_mm else self.b.add_mm - self.a.add_mm
+        first, second = self.errors
+        return 0.0 if first == second else second - first
 
 
 class Verdict(NamedTuple):
@@ -188,7 +197,10 @@ def list_verdict(pairs: Sequence[Pair], names: tuple[str, str]) -> list[Block]:
     if finite:
         change = f"{median(finite):+.2g} mm"
         middle = f"The median change of the error from the first to the second is {change}."
-    how = "Sign test over images: those whose errors differ by less than 0.05 mm do not count."
+    how = (
+        f"Sign test over images, by {name_error(pairs)}: those whose errors differ by less than "
+        "0.05 mm do not count."
+    )
     return [Paragraph([*words, middle]), Paragraph([Text(how, "soft")])]
 
 
@@ -208,14 +220,21 @@ def tabulate_common(rows: dict[str, list[ImageError]]) -> Table:
     return Table(("", *rows, "change"), cells, numeric=(1, 2, 3), form="narrow")
 
 
+def name_error(pairs: Sequence[Pair]) -> str:
+    """Return what the error of images is that are compared."""
+    plain = all(pair.errors == (pair.a.add_mm, pair.b.add_mm) for pair in pairs)
+    return "ADD" if plain else "ADD up to symmetry"
+
+
 def chart_pairs(pairs: Sequence[Pair], names: tuple[str, str]) -> list[Panel]:
     """Return a chart with a dot an image: one run's error against the other's."""
-    both = [pair for pair in pairs if all(0 < row.add_mm < math.inf for row in pair)]
+    both = [pair.errors for pair in pairs if all(0 < error < math.inf for error in pair.errors)]
     if not both:
         return []
-    least, most = (f(row.add_mm for pair in both for row in pair) for f in (min, max))
-    dots = Line("an image", [pair.a.add_mm for pair in both], [pair.b.add_mm for pair in both])
-    title, side, ends = f"ADD of {names[1]}", f"ADD of {names[0]} [mm]", (least, most)
+    least, most = (f(error for errors in both for error in errors) for f in (min, max))
+    dots = Line("an image", [a for a, _ in both], [b for _, b in both])
+    kind = name_error(pairs)
+    title, side, ends = f"{kind} of {names[1]}", f"{kind} of {names[0]} [mm]", (least, most)
     return [Panel(title, side, "mm", [dots], joined=False, log_x=True, log_y=True, diagonal=ends)]
 
 
@@ -231,13 +250,12 @@ def list_changes_of_images(pairs: Sequence[Pair], names: tuple[str, str]) -> lis
             [
                 Text(pair.a.image, "code"),
                 "–" if math.isnan(pair.a.visibility) else f"{pair.a.visibility:.2f}",
-                *(format_length(row.add_mm / 1000) for row in pair),
+                *(format_length(error / 1000) for error in pair.errors),
             ]
             for pair in ahead[:LISTED]
         ]
-        table = Table(
-            ("image", "visible share", *(f"ADD of {own}" for own in names)), rows, numeric=(1, 2, 3)
-        )
+        head = ("image", "visible share", *(f"{name_error(pairs)} of {own}" for own in names))
+        table = Table(head, rows, numeric=(1, 2, 3))
         out += [Heading(f"Where {name} is most ahead"), table] if rows else []
     return out
 

@@ -2,6 +2,7 @@
 
 import re
 from collections.abc import Iterable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -90,12 +91,14 @@ class BopReader(BaseReader):
         need_text("split", split)
         self._inverted = inverted
         base = self.root / split if split else self.root
-        folders = sorted(_scene_folders(base))
+        missing = self.root.is_dir() and not base.is_dir()
+        folders = [] if missing else sorted(_scene_folders(base))
         if not folders:
-            splits = sorted({path.parts[-3] for path in base.glob("*/*/scene_gt.json")})
+            home = self.root if missing else base
+            splits = sorted({path.parts[-3] for path in home.glob("*/*/scene_gt.json")})
+            why = "no such folder" if missing else "no BOP scenes here: no <scene>/scene_gt.json"
             raise UserError(
-                f"{base}: no BOP scenes here: no <scene>/scene_gt.json (data.root, "
-                f"data.options.split={'|'.join(splits) or '...'})"
+                f"{base}: {why} (data.root, data.options.split={'|'.join(splits) or '...'})"
             )
         if not any((folder / "scene_gt.json").exists() for folder in folders):
             raise UserError(
@@ -294,3 +297,14 @@ def _scene_folders(base: Path) -> Iterator[Path]:
     for name in list_folder(base):
         if _SCENE.fullmatch(name) and (base / name).is_dir():
             yield base / name
+        elif _is_file(base / name / "scene_gt.json"):
+            raise UserError(
+                f"{base / name}: scenes are named by numbers, such as 000001; rename it, or move "
+                "it out of the dataset"
+            )
+
+
+def _is_file(path: Path) -> bool:
+    with suppress(OSError):  # its folder may not be read, and need not
+        return path.is_file()
+    return False

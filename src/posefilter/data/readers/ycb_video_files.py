@@ -4,6 +4,7 @@ import io
 import re
 import zlib
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, Literal
 
@@ -50,7 +51,11 @@ def read_class_names(root: Path) -> tuple[str, ...]:
 
 
 def list_scenes(root: Path, subsets: set[str]) -> Iterator[tuple[str, Path]]:
-    """Yield scenes by name: those of `data` by number, `data_syn` as one."""
+    """Yield scenes by name: those of `data` by number, `data_syn` as one.
+
+    Raises:
+        UserError: A folder of frames in `data` has another name: it would be left out.
+    """
     if list_stems(root):
         yield (SYNTHETIC if root.name == SYNTHETIC else root.name), root
         return
@@ -59,8 +64,21 @@ def list_scenes(root: Path, subsets: set[str]) -> Iterator[tuple[str, Path]]:
     data = root / "data" if (root / "data").is_dir() else root
     if "data" in subsets:
         for name in list_folder(data):
-            if FRAME.fullmatch(name) and (data / name).is_dir():
+            if name == SYNTHETIC or not (data / name).is_dir():
+                continue
+            if FRAME.fullmatch(name):
                 yield name, data / name
+            elif _holds_frames(data / name):
+                raise UserError(
+                    f"{data / name}: scenes are named by numbers, such as 0001; rename it, or move "
+                    "it out of the dataset"
+                )
+
+
+def _holds_frames(folder: Path) -> bool:
+    with suppress(BadData):  # it may not be read, and need not
+        return bool(list_stems(folder))
+    return False
 
 
 def list_stems(folder: Path) -> list[str]:
