@@ -106,6 +106,25 @@ def test_a_distortion_is_not_passed_over(tmp_path: Path) -> None:
     assert read_intrinsics(str(path), distorted=True).K[0, 0] == 900
 
 
+def test_coefficients_of_another_model_are_not_advised_as_opencvs(tmp_path: Path) -> None:
+    path = tmp_path / "fisheye.yaml"
+    lens = ROS.replace("[0, 0, 0, 0, 0]", "[-0.03, 0.01, -0.02, 0.005]")
+    path.write_text(lens.replace("plumb_bob", "equidistant"))
+    for distorted in (False, True):  # typed beside the file, or not
+        with pytest.raises(UserError, match=r"tells a distortion \(equidistant\)") as caught:
+            read_intrinsics(str(path), distorted)
+        assert "distortion=-0.03" not in str(caught.value)
+    camera = tmp_path / "realsense.json"
+    for model, known in (("brown_conrady", True), ("inverse_brown_conrady", False)):
+        own = REALSENSE | {"model": f"distortion.{model}", "coeffs": [0.01, -0.02, 0, 0, 0]}
+        camera.write_text(json.dumps(own))
+        with pytest.raises(UserError) as caught:
+            read_intrinsics(str(camera))
+        assert ("distortion=0.01,-0.02,0,0,0" in str(caught.value)) == known
+    camera.write_text(json.dumps(REALSENSE | {"model": "distortion.inverse_brown_conrady"}))
+    np.testing.assert_array_equal(read_intrinsics(str(camera)).K, K)
+
+
 def test_numbers_are_four_or_a_matrix() -> None:
     for typed in (
         "1066.778,1067.487,312.9869,241.3109",

@@ -16,6 +16,9 @@ _MATRICES = ("camera_matrix", "intrinsic_matrix", "cam_K", "K", "k")
 _INNER = ("intrinsic", "intrinsics", "camera", "depth_intrinsics", "color_intrinsics")
 _DISTORTIONS = ("distortion_coefficients", "coeffs", "dist_coeffs", "distortion", "D", "d")
 _PROJECTIONS = ("projection_matrix", "P", "p")
+_MODELS = ("distortion_model", "model")  # keys of the kind of distortion
+# kinds that are OpenCV's polynomial, as `distortion=` takes it
+_POLYNOMIALS = ("", "none", "plumb_bob", "rational_polynomial", "brown_conrady", "radtan", "opencv")
 _SIZES = (("width", "height"), ("image_width", "image_height"), ("w", "h"))
 
 
@@ -25,6 +28,7 @@ class CameraFile(NamedTuple):
     K: np.ndarray  # camera matrix (3, 3), float64 [px]
     size: tuple[int, int] | None = None  # height and width of its images [px], if they are told
     distortion: tuple[float, ...] = ()  # of its lens, in OpenCV's order
+    other_model: str = ""  # the distortion's kind, where that is not OpenCV's polynomial
     rectified: np.ndarray | None = None  # (3, 3) of its rectified images, where the file has one
 
 
@@ -83,7 +87,18 @@ def _of_camera(content: Mapping[str, Any], K: np.ndarray, path: Path) -> CameraF
     projection = _listed(content, _PROJECTIONS)
     P = None if projection is None else numbers(projection, "data", path, (3, 4))
     rectified = None if P is None or P[0, 0] <= 0 else P[:, :3]
-    return CameraFile(K, size, coefficients if any(coefficients) else (), rectified)
+    if not any(coefficients):
+        return CameraFile(K, size, rectified=rectified)
+    return CameraFile(K, size, coefficients, _find_other_model(content), rectified)
+
+
+def _find_other_model(content: Mapping[str, Any]) -> str:
+    """Return the kind of distortion that a mapping tells, "" where it is OpenCV's polynomial, or
+    not told.
+    """
+    told = next((str(content[key]) for key in _MODELS if content.get(key) is not None), "")
+    plain = told.lower().removeprefix("distortion.").replace(" ", "_")  # as RealSense's tools do
+    return "" if plain in _POLYNOMIALS else told
 
 
 def _find_matrix(content: Mapping[str, Any], path: Path) -> np.ndarray | None:
