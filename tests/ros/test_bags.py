@@ -582,6 +582,22 @@ def test_a_topic_of_several_connections_is_copied(tmp_path: Path) -> None:
     assert [one[:2] for one in read_bag(tmp_path / "out")] == [("/rgb", 1), ("/rgb", 2)]
 
 
+def test_copies_have_the_definitions_that_a_bag_of_humble_lacks(tmp_path: Path) -> None:
+    """A viewer of MCAP reads no message without; of a type that is not ROS's own there is none."""
+    with Writer(tmp_path / "in", version=8, storage_plugin=StoragePlugin.MCAP) as writer:
+        known = writer.add_connection("/rgb", IMAGE, typestore=open_types())
+        bare = known._replace(msgdef=known.msgdef._replace(data=""), digest="")
+        own = bare._replace(id=2, topic="/own", msgtype="own_msgs/msg/Own")
+        writer.write(known, 1, b"")
+    with BagWriter(tmp_path / "out", "/found") as out:
+        out.add_connections([bare, own])
+    with Reader(tmp_path / "out") as reader:
+        written = {one.topic: one for one in reader.connections}
+    assert "uint32 height" in written["/rgb"].msgdef.data
+    assert written["/rgb"].digest == known.digest
+    assert written["/own"].msgdef.data == ""
+
+
 def test_a_topic_that_is_there_is_refused_before_the_work(
     tmp_path: Path, capfd, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -392,11 +392,15 @@ class BagWriter:
                 )
             kind = (one.topic, one.msgtype, one.ext)
             same = next((copy for other, copy in added if other == kind), None)
+            types = open_types()
+            # SQLite bags of Humble have no definitions, which viewers of MCAP need
+            known = not one.msgdef.data and one.msgtype in types.fielddefs
             self.copies[one.id] = same or self.writer.add_connection(
                 one.topic,
                 one.msgtype,
-                msgdef=one.msgdef.data,
-                rihs01=one.digest or "RIHS01_",
+                typestore=types,
+                msgdef=None if known else one.msgdef.data,
+                rihs01=None if known else one.digest or "RIHS01_",
                 serialization_format=one.ext.serialization_format,
                 offered_qos_profiles=one.ext.offered_qos_profiles,
             )
