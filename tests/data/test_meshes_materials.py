@@ -84,6 +84,17 @@ def test_concave_faces_without_end_are_refused(tmp_path: Path) -> None:
         read_mesh(tmp_path / "a.obj", "a")
 
 
+def test_faces_before_the_first_material_have_none(tmp_path: Path) -> None:
+    (tmp_path / "a.mtl").write_text("newmtl red\nKd 1 0 0\n")
+    corners = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\n"
+    faces = ["f 1 3 2\nf 1 2 4\n", "f 1 4 3\nf 2 3 4\n"]
+    (tmp_path / "a.obj").write_text(f"mtllib a.mtl\n{corners}{faces[0]}usemtl red\n{faces[1]}")
+    mesh = read_mesh(tmp_path / "a.obj", "a")
+    colors = surface_colors(mesh, np.arange(4), np.full((4, 3), 1 / 3))
+    np.testing.assert_allclose(colors[:2], 0.7, atol=0.01)
+    np.testing.assert_allclose(colors[2:], [[1, 0, 0]] * 2)
+
+
 @pytest.mark.parametrize("order", ["<", ">"])
 def test_binary_ply_with_faces_of_several_sizes(order: str, tmp_path: Path) -> None:
     vertices = [(0, 0, 0), (1, 0, 0), (1, 1, 0), (0, 1, 0), (0.5, 0.5, 1), (2, 0, 0), (2, 1, 0)]

@@ -104,7 +104,7 @@ def read_obj(path: Path) -> RawMesh:
     polygons: dict[int, list[int]] = {}  # by number of corners: the first triangle of each
     library: dict[str, Material] = {}
     images: dict[Path, np.ndarray] = {}
-    materials: dict[str, int] = {}
+    materials: dict[str | None, int] = {}
     current = 0
     for key, rest in _read_lines(path):
         if key in numbers:
@@ -121,6 +121,8 @@ def read_obj(path: Path) -> RawMesh:
             for file in rest.split() if several else [rest]:
                 library |= _read_mtl(path.parent / file, path, images)
         elif key == "usemtl":
+            if face_material and not materials:  # the faces before have none
+                materials[None] = 0
             current = materials.setdefault(rest, len(materials))
     index = np.array(corners, dtype=np.int64).reshape(-1, 3, 3)  # face, corner, (v, vt, vn)
     vertices = _rectangle(numbers["v"], 3)
@@ -128,7 +130,7 @@ def read_obj(path: Path) -> RawMesh:
     colors = _rectangle(numbers["v"], 6)[:, 3:] if colored else None
     if colors is not None and colors.max(initial=0.0) > _BRIGHTEST:  # numbers of 8 bits
         colors = colors / 255
-    unknown = [name for name in materials if name not in library]
+    unknown = [name for name in materials if name is not None and name not in library]
     if unknown and len(numbers["vt"]) and colors is None:
         raise UserError(
             f"{path}: its material '{unknown[0]}' is in no material file (mtllib), so that its "
@@ -136,7 +138,8 @@ def read_obj(path: Path) -> RawMesh:
         )
     # colors of vertices are whole by themselves
     plain = PLAIN if colors is None else PLAIN._replace(color=np.ones(3))
-    known = [library.get(name, plain) for name in materials] or [*library.values(), plain][:1]
+    known = [plain if name is None else library.get(name, plain) for name in materials]
+    known = known or [*library.values(), plain][:1]
     faces = index[..., 0]
     if len(faces) and (faces.min() < 0 or faces.max() >= len(vertices)):
         raise UserError(f"{path}: a face names a vertex that is not there (is the file cut short?)")
