@@ -511,6 +511,7 @@ def test_mistakes_are_one_line(tmp_path: Path, capfd) -> None:
         ([str(tmp_path / "old.bag")], [], "it is of ROS 1"),
         ([str(tmp_path / "no.mcap")], [], "no such file"),
         ([str(bag), str(tmp_path / "there.mcap")], [], "already exists"),
+        ([str(bag), str(tmp_path / "new.db3")], [], "bags are written as MCAP"),
         ([str(bag)], ["track=maybe"], "choose true or false"),
         ([str(bag)], ["detections=my topic"], "is no name of a topic"),
         ([str(near)], [], "image of 0.100 s: depth: the median would be 0.01"),
@@ -522,7 +523,7 @@ def test_mistakes_are_one_line(tmp_path: Path, capfd) -> None:
         error = capfd.readouterr().err.strip()
         assert said in error
         assert "\n" not in error
-    assert not (tmp_path / "new.mcap").exists()
+    assert [*tmp_path.glob("new.*")] == []
     assert [one.name for one in tmp_path.glob(".*")] == []
     assert (tmp_path / "there.mcap").read_text() == "mine"
 
