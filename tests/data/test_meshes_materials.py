@@ -407,6 +407,12 @@ def _export_with_colors(body: trimesh.Trimesh, colors: np.ndarray, path: Path) -
 CHANGES = {
     "sparse": (lambda t: t["accessors"][0].update(sparse={}), "sparse array"),
     "fan": (lambda t: t["meshes"][0]["primitives"][0].update(mode=6), "fan of triangles"),
+    "shape key": (lambda t: t["meshes"][0].update(weights=[0.0, 1.0]), "shape key that is on"),
+    "skeleton": (lambda t: t["nodes"][-1].update(skin=0), "posed by a skeleton"),
+    "instances": (
+        lambda t: t.update(extensionsUsed=["EXT_mesh_gpu_instancing"]),
+        "uses EXT_mesh_gpu_instancing",
+    ),
     "second coordinates": (
         lambda t: t["materials"][0]["pbrMetallicRoughness"].update(
             baseColorTexture={"index": 0, "texCoord": 1}
