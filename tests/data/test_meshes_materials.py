@@ -188,6 +188,24 @@ PLY = (
 )
 
 
+@pytest.mark.parametrize("encoding", ["ascii", "binary_little_endian"])
+@pytest.mark.parametrize("brightest", [1.0, 255.0])
+def test_float_colors_of_a_ply_are_shares(encoding: str, brightest: float, tmp_path: Path) -> None:
+    names = "".join(f"property float {name}\n" for name in ("x", "y", "z", "red", "green", "blue"))
+    head = f"ply\nformat {encoding} 1.0\nelement vertex 3\n{names}element face 1\n"
+    head += "property list uchar int vertex_indices\nend_header\n"
+    rows = np.hstack([np.eye(3), np.tile([brightest, brightest / 2, 0], (3, 1))]).astype("<f4")
+    text = "".join(" ".join(map(str, row)) + "\n" for row in rows.tolist()) + "3 0 1 2\n"
+    body = rows.tobytes() + struct.pack("<B3i", 3, 0, 1, 2)
+    (tmp_path / "a.ply").write_bytes(head.encode() + (text.encode() if "asc" in encoding else body))
+    if brightest > 1:
+        with pytest.raises(UserError, match="colors of floats above 1"):
+            read_mesh(tmp_path / "a.ply", "a")
+    else:
+        colors = surface_colors(read_mesh(tmp_path / "a.ply", "a"), np.array([0]), MIDDLE)
+        np.testing.assert_allclose(colors, [[1, 0.5, 0]], atol=0.005)
+
+
 def test_broken_text_ply_is_refused(tmp_path: Path) -> None:
     rows = "0 0 0\n1 0 0\n1 1 0\n0 1 0\n3 0 1 2\n3 0 2 3\n"
     path = tmp_path / "a.ply"

@@ -21,7 +21,7 @@ class Material(NamedTuple):
 
 
 PLAIN = Material(np.full(3, 0.7), None)
-_BRIGHTEST = 2.0  # of colors in [0, 1], as exporters that round or light them write
+BRIGHTEST = 2.0  # of colors in [0, 1], as exporters that round or light them write
 MOST_TEXELS = 1 << 28  # pixels of all textures of a mesh
 
 
@@ -128,7 +128,7 @@ def read_obj(path: Path) -> RawMesh:
     vertices = _rectangle(numbers["v"], 3)
     colored = len(numbers["v"]) > 0 and len(numbers["v"][0]) >= 6
     colors = _rectangle(numbers["v"], 6)[:, 3:] if colored else None
-    if colors is not None and colors.max(initial=0.0) > _BRIGHTEST:  # numbers of 8 bits
+    if colors is not None and colors.max(initial=0.0) > BRIGHTEST:  # numbers of 8 bits
         colors = colors / 255
     unknown = [name for name in materials if name is not None and name not in library]
     if unknown and len(numbers["vt"]) and colors is None:
