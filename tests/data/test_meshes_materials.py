@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import pytest
 import trimesh
-from PIL import Image
+from PIL import ExifTags, Image
 from scipy.spatial.distance import pdist
 
 from posefilter.errors import UserError
@@ -135,6 +135,18 @@ def test_vertex_colors_of_an_obj_are_as_they_are(tmp_path: Path) -> None:
     path = _write_text(tmp_path / "a.obj", CORNERS.format("1 0.5 0") + "f 1 2 3\n")
     colors = surface_colors(read_mesh(path, "a"), np.array([0]), MIDDLE)
     np.testing.assert_allclose(colors, [[1, 0.5, 0]], atol=1e-6)
+
+
+def test_a_picture_that_says_it_is_turned_is_read_as_it_is_stored(tmp_path: Path) -> None:
+    exif = Image.Exif()
+    exif[ExifTags.Base.Orientation] = 3  # upside down
+    stored = np.zeros((16, 32, 3), np.uint8)
+    stored[:8] = 200
+    Image.fromarray(stored).save(tmp_path / "p.jpg", exif=exif)
+    (tmp_path / "a.mtl").write_text("newmtl m\nmap_Kd p.jpg\n")
+    text = "mtllib a.mtl\n" + CORNERS.format("") + "usemtl m\nf 1/1 2/2 3/3\n"
+    path = _write_text(tmp_path / "a.obj", text)
+    np.testing.assert_allclose(read_mesh(path, "a").texture, stored, atol=3)
 
 
 @pytest.mark.parametrize(

@@ -1,6 +1,7 @@
 """Bags in and out: the library's poses in ROS's conventions, and only what was there."""
 
 import dataclasses
+import io
 import json
 import math
 import os
@@ -16,6 +17,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from PIL import ExifTags, Image
 
 pytest.importorskip("rosbags", reason="needs the extra bags")
 
@@ -285,6 +287,17 @@ def test_images_are_read_in_every_layout() -> None:
     np.testing.assert_allclose(decode_depth(message, "/d"), kept[:1], rtol=1e-6)
     K = np.array([[500.0, 0, 320], [0, 510, 240], [0, 0, 1]])
     np.testing.assert_array_equal(decode_intrinsics(make_info(K), (480, 640)), K)
+
+
+def test_a_jpeg_that_says_it_is_turned_is_read_as_it_is_stored() -> None:
+    """As the depth and the camera_info beside it."""
+    exif = Image.Exif()
+    exif[ExifTags.Base.Orientation] = 3  # upside down
+    stored, data = np.zeros((16, 32, 3), np.uint8), io.BytesIO()
+    stored[:8] = 200
+    Image.fromarray(stored).save(data, "JPEG", exif=exif)
+    read = decode_color(make_compressed("rgb8; jpeg compressed bgr8", data.getvalue()), "/rgb")
+    np.testing.assert_allclose(read, stored, atol=3)
 
 
 def make_png(width: int, height: int) -> bytes:

@@ -55,7 +55,8 @@ def read_image(path: Path, source: Path) -> np.ndarray:
         raise UserError(f"{path}: missing texture, named by {source.name}")
     data = read_bytes(path)
     check_picture(path, data)
-    image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
+    as_stored = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION  # as of PLY and GLB
+    image = cv2.imdecode(np.frombuffer(data, np.uint8), as_stored)
     if image is None:
         raise UserError(
             f"{path}: not a readable picture (is it cut short?), named by {source.name}"
