@@ -5,7 +5,16 @@ python examples/onnx/pixels.py drill rgb.png depth.png fx,fy,cx,cy 10000
 """
 
 import numpy as np
-from poses import draw, draw_poses, fit_rigid, open_export, read_arguments, resample, softmax
+from poses import (
+    draw,
+    draw_poses,
+    fit_rigid,
+    open_export,
+    read_arguments,
+    resample,
+    softmax,
+    take_image,
+)
 
 
 class PixelFilter:
@@ -19,8 +28,7 @@ class PixelFilter:
         and the last particles by name; `start` (N, 2) [px]: the first ones, else they are drawn.
         """
         s, rng = self.settings, np.random.default_rng(seed)
-        image = {"rgb": rgb, "depth": np.float32(depth), "intrinsics": np.float32(intrinsics)}
-        scene = run(self.encode, image)
+        scene = run(self.encode, take_image(s, rgb, depth, intrinsics))
         state = self.draw_pixels(scene, rng) if start is None else start
         latent = np.zeros((len(state), s["latent_width"]), np.float32)
         found, weights = {}, np.ones(len(state)) / len(state)

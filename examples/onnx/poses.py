@@ -26,6 +26,18 @@ def open_export(folder, threads):
     return json.loads((Path(folder) / "filter.json").read_text()), *networks
 
 
+def take_image(settings, rgb, depth, intrinsics):
+    """An image as `encode` reads it: RGB (H, W, 3) uint8, depth (H, W) [m], (3, 3)."""
+    size = (settings["camera"][1], settings["camera"][0])
+    if rgb.shape[:2] != size or depth.shape != size:
+        sys.exit(f"exported for images of {size[1]}x{size[0]}: export with width=, height=")
+    depth = np.float32(np.where(depth < 100, depth, 0))  # what is farther is not measured
+    known = depth[depth > 0]
+    if not len(known) or not 0.05 <= np.median(known) <= 30:
+        sys.exit("depth: no pixel has any, or it is not in meters")
+    return {"rgb": rgb, "depth": depth, "intrinsics": np.float32(intrinsics)}
+
+
 class PoseFilter:
     """What `export.py format=onnx` wrote of a `pose_pf`."""
 
@@ -37,13 +49,8 @@ class PoseFilter:
         """RGB (H, W, 3) uint8, depth (H, W) [m], (3, 3) -> camera_from_object (4, 4), its score,
         and the belief: poses (N, 4, 4), weights (N,).
         """
-        s, rng = self.settings, np.random.default_rng(seed)
-        size = (s["camera"][1], s["camera"][0])
-        if rgb.shape[:2] != size or depth.shape != size:
-            sys.exit(f"exported for images of {size[1]}x{size[0]}: export with width=, height=")
-        depth = np.float32(np.where(depth < 100, depth, 0))  # what is farther is not measured
-        image = {"rgb": rgb, "depth": depth, "intrinsics": np.float32(intrinsics)}
-        return self.search(image, rng, s.get("zoom"))
+        image = take_image(self.settings, rgb, depth, intrinsics)
+        return self.search(image, np.random.default_rng(seed), self.settings.get("zoom"))
 
     def search(self, image, rng, zoom):
         """Run the filter on an image; with `zoom`, on a magnified window if the object is small."""

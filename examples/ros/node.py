@@ -33,7 +33,7 @@ from posefilter.ros.detections import (
     measure_box,
     to_ros_covariance,
 )
-from posefilter.ros.messages import decode_color, decode_depth, decode_intrinsics
+from posefilter.ros.messages import decode_color, decode_depth, decode_intrinsics, is_distorted
 
 _WAITING = 10  # messages of a topic that wait for those of the others: depth may come frames later
 _SILENCE = 5.0  # [s] without images after which a warning says so
@@ -99,6 +99,12 @@ class PoseNode(Node):
                 f"color, depth and camera_info are of the frames {', '.join(sorted(frames))}: is "
                 "depth aligned to the color?",
                 throttle_duration_sec=_SILENCE,
+            )
+        if is_distorted(camera):
+            self.get_logger().warning(
+                "camera_info tells a lens distortion, and images are taken as rectified ones: are "
+                "color and depth rectified, as by image_proc?",
+                once=True,
             )
         for one in results:
             if one.wrong_size or one.blank:

@@ -13,6 +13,7 @@ from posefilter.cli.job import Job
 from posefilter.cli.plain import key_of
 from posefilter.confidence.tolerance import PoseTolerance
 from posefilter.confidence.verdicts import Costs
+from posefilter.devices import take_threads
 from posefilter.errors import UserError
 from posefilter.estimator import Estimator
 from posefilter.models.base import PoseEstimator
@@ -68,6 +69,7 @@ def load(
     """
     overrides = check_overrides(overrides)
     wanted = changes(compose(overrides, "predict")) if overrides else {}
+    take_threads()
     return Estimator(methods_of(weights, wanted), device, costs, pose_tolerance)
 
 

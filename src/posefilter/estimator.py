@@ -13,7 +13,7 @@ from omegaconf import OmegaConf
 from posefilter.confidence.blank import find_blank
 from posefilter.confidence.tolerance import PoseTolerance, check_pose_tolerance
 from posefilter.confidence.verdicts import Costs, check_costs
-from posefilter.devices import choose_device
+from posefilter.devices import choose_device, take_threads
 from posefilter.errors import UserError, check_seed, find_reason
 from posefilter.images import Images, check_images, make_batch
 from posefilter.instances.detect import detect
@@ -146,6 +146,7 @@ class Estimator:
     def _detect(self, images: Images, counts: Sequence[int], seed: int) -> list[list[Result]]:
         """Find several instances: a list of results an image, the most probable first."""
         seed = check_seed(seed)
+        take_threads()
         for method in self.methods:
             method.seed = seed
         size = (images.depth.shape[1], images.depth.shape[2])
@@ -185,6 +186,7 @@ class Estimator:
         The trace's belief is the calibrated one, where there is one.
         """
         seed = check_seed(seed)
+        take_threads()
         runs, blank = [], list_blank(images)
         for method, size in zip(self.methods, self._sizes, strict=True):
             batch = Batch(*(x.to(method.device) for x in make_batch(images, *size)))

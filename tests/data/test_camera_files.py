@@ -34,6 +34,7 @@ SIZE = (480, 640)
         ("realsense.json", REALSENSE, SIZE),
         ("inner.json", {"intrinsics": REALSENSE}, SIZE),
         ("open3d.json", {"width": 640, "height": 480, "intrinsic_matrix": K.T.ravel()}, SIZE),
+        ("beside.json", {"intrinsics": FOUR, "width": 640, "height": 480}, SIZE),
         (
             "parameters.json",
             {"extrinsic": [1], "intrinsic": {"intrinsic_matrix": K.T.ravel()}},
@@ -104,6 +105,46 @@ def test_a_distortion_is_not_passed_over(tmp_path: Path) -> None:
     assert read_intrinsics(raw).K[0, 0] == 900
     assert "distortion=0.1,-0.2,0,0,0" in str(caught.value)
     assert read_intrinsics(str(path), distorted=True).K[0, 0] == 900
+
+
+@pytest.mark.parametrize(
+    ("content", "told"),
+    [
+        ({"intrinsics": FOUR, "distortion": [0.1, -0.2, 0, 0, 0]}, "0.1,-0.2,0,0,0"),
+        (FOUR | {"p2": 0.01, "k1": 0.1, "k3": 0.2}, "0.1,0,0,0.01,0.2"),
+        (FOUR | {"distortion": {"k1": 0.1, "k6": 0.3}}, "0.1,0,0,0,0,0,0,0.3"),
+    ],
+)
+def test_a_distortion_is_found_where_it_is_told(content: Any, told: str, tmp_path: Path) -> None:
+    path = tmp_path / "camera.json"
+    path.write_text(json.dumps(content))
+    with pytest.raises(UserError, match=f"distortion={told}$"):
+        read_intrinsics(str(path))
+
+
+def test_named_coefficients_of_0_are_no_distortion(tmp_path: Path) -> None:
+    path = tmp_path / "camera.json"
+    path.write_text(json.dumps(FOUR | dict.fromkeys(("k1", "k2", "p1", "p2", "k3"), 0)))
+    np.testing.assert_array_equal(read_intrinsics(str(path)).K, K)
+
+
+def test_coefficients_of_another_model_are_not_advised_as_opencvs(tmp_path: Path) -> None:
+    path = tmp_path / "fisheye.yaml"
+    lens = ROS.replace("[0, 0, 0, 0, 0]", "[-0.03, 0.01, -0.02, 0.005]")
+    path.write_text(lens.replace("plumb_bob", "equidistant"))
+    for distorted in (False, True):  # typed beside the file, or not
+        with pytest.raises(UserError, match=r"tells a distortion \(equidistant\)") as caught:
+            read_intrinsics(str(path), distorted)
+        assert "distortion=-0.03" not in str(caught.value)
+    camera = tmp_path / "realsense.json"
+    for model, known in (("brown_conrady", True), ("inverse_brown_conrady", False)):
+        own = REALSENSE | {"model": f"distortion.{model}", "coeffs": [0.01, -0.02, 0, 0, 0]}
+        camera.write_text(json.dumps(own))
+        with pytest.raises(UserError) as caught:
+            read_intrinsics(str(camera))
+        assert ("distortion=0.01,-0.02,0,0,0" in str(caught.value)) == known
+    camera.write_text(json.dumps(REALSENSE | {"model": "distortion.inverse_brown_conrady"}))
+    np.testing.assert_array_equal(read_intrinsics(str(camera)).K, K)
 
 
 def test_numbers_are_four_or_a_matrix() -> None:

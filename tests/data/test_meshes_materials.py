@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import pytest
 import trimesh
-from PIL import Image
+from PIL import ExifTags, Image
 from scipy.spatial.distance import pdist
 
 from posefilter.errors import UserError
@@ -84,6 +84,17 @@ def test_concave_faces_without_end_are_refused(tmp_path: Path) -> None:
         read_mesh(tmp_path / "a.obj", "a")
 
 
+def test_faces_before_the_first_material_have_none(tmp_path: Path) -> None:
+    (tmp_path / "a.mtl").write_text("newmtl red\nKd 1 0 0\n")
+    corners = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\n"
+    faces = ["f 1 3 2\nf 1 2 4\n", "f 1 4 3\nf 2 3 4\n"]
+    (tmp_path / "a.obj").write_text(f"mtllib a.mtl\n{corners}{faces[0]}usemtl red\n{faces[1]}")
+    mesh = read_mesh(tmp_path / "a.obj", "a")
+    colors = surface_colors(mesh, np.arange(4), np.full((4, 3), 1 / 3))
+    np.testing.assert_allclose(colors[:2], 0.7, atol=0.01)
+    np.testing.assert_allclose(colors[2:], [[1, 0, 0]] * 2)
+
+
 @pytest.mark.parametrize("order", ["<", ">"])
 def test_binary_ply_with_faces_of_several_sizes(order: str, tmp_path: Path) -> None:
     vertices = [(0, 0, 0), (1, 0, 0), (1, 1, 0), (0, 1, 0), (0.5, 0.5, 1), (2, 0, 0), (2, 1, 0)]
@@ -124,6 +135,18 @@ def test_vertex_colors_of_an_obj_are_as_they_are(tmp_path: Path) -> None:
     path = _write_text(tmp_path / "a.obj", CORNERS.format("1 0.5 0") + "f 1 2 3\n")
     colors = surface_colors(read_mesh(path, "a"), np.array([0]), MIDDLE)
     np.testing.assert_allclose(colors, [[1, 0.5, 0]], atol=1e-6)
+
+
+def test_a_picture_that_says_it_is_turned_is_read_as_it_is_stored(tmp_path: Path) -> None:
+    exif = Image.Exif()
+    exif[ExifTags.Base.Orientation] = 3  # upside down
+    stored = np.zeros((16, 32, 3), np.uint8)
+    stored[:8] = 200
+    Image.fromarray(stored).save(tmp_path / "p.jpg", exif=exif)
+    (tmp_path / "a.mtl").write_text("newmtl m\nmap_Kd p.jpg\n")
+    text = "mtllib a.mtl\n" + CORNERS.format("") + "usemtl m\nf 1/1 2/2 3/3\n"
+    path = _write_text(tmp_path / "a.obj", text)
+    np.testing.assert_allclose(read_mesh(path, "a").texture, stored, atol=3)
 
 
 @pytest.mark.parametrize(
@@ -175,6 +198,24 @@ PLY = (
     "ply\nformat ascii 1.0\nelement vertex 4\nproperty float x\nproperty float y\n"
     "property float z\n{0}element face {1}\nproperty list uchar int vertex_indices\n{2}end_header\n"
 )
+
+
+@pytest.mark.parametrize("encoding", ["ascii", "binary_little_endian"])
+@pytest.mark.parametrize("brightest", [1.0, 255.0])
+def test_float_colors_of_a_ply_are_shares(encoding: str, brightest: float, tmp_path: Path) -> None:
+    names = "".join(f"property float {name}\n" for name in ("x", "y", "z", "red", "green", "blue"))
+    head = f"ply\nformat {encoding} 1.0\nelement vertex 3\n{names}element face 1\n"
+    head += "property list uchar int vertex_indices\nend_header\n"
+    rows = np.hstack([np.eye(3), np.tile([brightest, brightest / 2, 0], (3, 1))]).astype("<f4")
+    text = "".join(" ".join(map(str, row)) + "\n" for row in rows.tolist()) + "3 0 1 2\n"
+    body = rows.tobytes() + struct.pack("<B3i", 3, 0, 1, 2)
+    (tmp_path / "a.ply").write_bytes(head.encode() + (text.encode() if "asc" in encoding else body))
+    if brightest > 1:
+        with pytest.raises(UserError, match="colors of floats above 1"):
+            read_mesh(tmp_path / "a.ply", "a")
+    else:
+        colors = surface_colors(read_mesh(tmp_path / "a.ply", "a"), np.array([0]), MIDDLE)
+        np.testing.assert_allclose(colors, [[1, 0.5, 0]], atol=0.005)
 
 
 def test_broken_text_ply_is_refused(tmp_path: Path) -> None:
@@ -396,6 +437,12 @@ def _export_with_colors(body: trimesh.Trimesh, colors: np.ndarray, path: Path) -
 CHANGES = {
     "sparse": (lambda t: t["accessors"][0].update(sparse={}), "sparse array"),
     "fan": (lambda t: t["meshes"][0]["primitives"][0].update(mode=6), "fan of triangles"),
+    "shape key": (lambda t: t["meshes"][0].update(weights=[0.0, 1.0]), "shape key that is on"),
+    "skeleton": (lambda t: t["nodes"][-1].update(skin=0), "posed by a skeleton"),
+    "instances": (
+        lambda t: t.update(extensionsUsed=["EXT_mesh_gpu_instancing"]),
+        "uses EXT_mesh_gpu_instancing",
+    ),
     "second coordinates": (
         lambda t: t["materials"][0]["pbrMetallicRoughness"].update(
             baseColorTexture={"index": 0, "texCoord": 1}

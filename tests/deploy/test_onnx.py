@@ -440,6 +440,18 @@ def test_the_examples_mistakes_are_one_line(
         poses.read_arguments("poses")
 
 
+def test_depth_that_is_not_in_meters_is_refused(poses: ModuleType) -> None:
+    rgb, depth, K = read_scene()
+    settings = {"camera": [depth.shape[1], depth.shape[0]]}
+    kept = poses.take_image(settings, rgb, np.where(depth > 0, depth, np.nan), K)["depth"]
+    np.testing.assert_array_equal(kept, depth)
+    for wrong in ((1000 * depth).astype(np.uint16), 1000 * depth, depth / 100, 0 * depth):
+        with pytest.raises(SystemExit, match="not in meters"):
+            poses.take_image(settings, rgb, wrong, K)
+    with pytest.raises(SystemExit, match="exported for images of 320x240"):
+        poses.take_image(settings, rgb[1:], depth[1:], K)
+
+
 @pytest.mark.parametrize(
     ("before", "width"), [((480, 640), 320), ((481, 643), 200), ((60, 80), 160), ((48, 64), 64)]
 )

@@ -14,6 +14,7 @@ import pytest
 import torch
 
 import posefilter
+from posefilter import devices
 from posefilter.cli.command import run_command
 from posefilter.images import check_images
 from posefilter.metrics.bop_results import read_poses_csv
@@ -506,3 +507,25 @@ def test_fewer_looks_keep_the_calibration() -> None:
         assert "calibrated for another filter" in changed.calibration_note
     with pytest.raises(posefilter.UserError, match=r"filter\.max_searches=5: must be 1, 2, 3 or 4"):
         posefilter.load("003_cracker_box", overrides=["filter.max_searches=5"], device="cpu")
+
+
+def test_a_fork_that_would_wait_for_threads_is_told(
+    estimator: posefilter.Estimator, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(devices, "_owner", None)
+    monkeypatch.setattr(torch, "get_num_threads", lambda: 2)
+    devices.take_threads()
+    devices.take_threads()
+    monkeypatch.setattr(devices.os, "getpid", lambda: -1)  # as in another process
+    images = read_scene()
+    tracker = posefilter.Tracker(estimator)
+    for compute in (
+        lambda: posefilter.load(NAME),
+        lambda: estimator.predict(*images),
+        lambda: estimator.predict(*images, instances=2),
+        lambda: tracker.update(*images),
+    ):
+        with pytest.raises(posefilter.UserError, match="get_context\\('spawn'\\)"):
+            compute()
+    monkeypatch.setattr(torch, "get_num_threads", lambda: 1)
+    devices.take_threads()

@@ -1,6 +1,7 @@
 """Bags in and out: the library's poses in ROS's conventions, and only what was there."""
 
 import dataclasses
+import io
 import json
 import math
 import os
@@ -16,6 +17,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from PIL import ExifTags, Image
 
 pytest.importorskip("rosbags", reason="needs the extra bags")
 
@@ -287,6 +289,17 @@ def test_images_are_read_in_every_layout() -> None:
     np.testing.assert_array_equal(decode_intrinsics(make_info(K), (480, 640)), K)
 
 
+def test_a_jpeg_that_says_it_is_turned_is_read_as_it_is_stored() -> None:
+    """As the depth and the camera_info beside it."""
+    exif = Image.Exif()
+    exif[ExifTags.Base.Orientation] = 3  # upside down
+    stored, data = np.zeros((16, 32, 3), np.uint8), io.BytesIO()
+    stored[:8] = 200
+    Image.fromarray(stored).save(data, "JPEG", exif=exif)
+    read = decode_color(make_compressed("rgb8; jpeg compressed bgr8", data.getvalue()), "/rgb")
+    np.testing.assert_allclose(read, stored, atol=3)
+
+
 def make_png(width: int, height: int) -> bytes:
     """Return a PNG of one color whose header names another size."""
     data = bytearray(cv2.imencode(".png", np.zeros((2, 2, 3), np.uint8))[1].tobytes())
@@ -511,6 +524,7 @@ def test_mistakes_are_one_line(tmp_path: Path, capfd) -> None:
         ([str(tmp_path / "old.bag")], [], "it is of ROS 1"),
         ([str(tmp_path / "no.mcap")], [], "no such file"),
         ([str(bag), str(tmp_path / "there.mcap")], [], "already exists"),
+        ([str(bag), str(tmp_path / "new.db3")], [], "bags are written as MCAP"),
         ([str(bag)], ["track=maybe"], "choose true or false"),
         ([str(bag)], ["detections=my topic"], "is no name of a topic"),
         ([str(near)], [], "image of 0.100 s: depth: the median would be 0.01"),
@@ -522,7 +536,7 @@ def test_mistakes_are_one_line(tmp_path: Path, capfd) -> None:
         error = capfd.readouterr().err.strip()
         assert said in error
         assert "\n" not in error
-    assert not (tmp_path / "new.mcap").exists()
+    assert [*tmp_path.glob("new.*")] == []
     assert [one.name for one in tmp_path.glob(".*")] == []
     assert (tmp_path / "there.mcap").read_text() == "mine"
 
@@ -580,6 +594,22 @@ def test_a_topic_of_several_connections_is_copied(tmp_path: Path) -> None:
         out.add_connections([first, second])
         out.copy(iter([(first, 1, message), (second, 2, message)]))
     assert [one[:2] for one in read_bag(tmp_path / "out")] == [("/rgb", 1), ("/rgb", 2)]
+
+
+def test_copies_have_the_definitions_that_a_bag_of_humble_lacks(tmp_path: Path) -> None:
+    """A viewer of MCAP reads no message without; of a type that is not ROS's own there is none."""
+    with Writer(tmp_path / "in", version=8, storage_plugin=StoragePlugin.MCAP) as writer:
+        known = writer.add_connection("/rgb", IMAGE, typestore=open_types())
+        bare = known._replace(msgdef=known.msgdef._replace(data=""), digest="")
+        own = bare._replace(id=2, topic="/own", msgtype="own_msgs/msg/Own")
+        writer.write(known, 1, b"")
+    with BagWriter(tmp_path / "out", "/found") as out:
+        out.add_connections([bare, own])
+    with Reader(tmp_path / "out") as reader:
+        written = {one.topic: one for one in reader.connections}
+    assert "uint32 height" in written["/rgb"].msgdef.data
+    assert written["/rgb"].digest == known.digest
+    assert written["/own"].msgdef.data == ""
 
 
 def test_a_topic_that_is_there_is_refused_before_the_work(

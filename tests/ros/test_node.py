@@ -167,6 +167,19 @@ def test_an_image_that_cannot_be_used_ends_nothing(example: dict[str, Any]) -> N
     assert said.startswith("color=color: encoding bayer_rggb16 is not known")
 
 
+def test_a_lens_distortion_is_told(example: dict[str, Any]) -> None:
+    node = example["PoseNode"]()
+    node.tracker.may_go.release(9)
+    color, depth, camera = make_messages(7)
+    node.answer(color, depth, camera)
+    assert not node.log
+    camera.d = np.array([0.1, -0.2, 0, 0, 0])
+    node.answer(color, depth, camera)
+    node.close()
+    (said,) = node.log
+    assert said.startswith("camera_info tells a lens distortion")
+
+
 def test_silence_is_told(example: dict[str, Any]) -> None:
     node = example["PoseNode"]()
     node.tracker.may_go.release(9)

@@ -1,13 +1,16 @@
 """The figures of a track's rows."""
 
+import weakref
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
-from tests.tracking.toy import make_toy
+from tests.tracking.toy import DEPTH, RGB, K, make_toy
 
+from posefilter.tracking import records
 from posefilter.tracking.records import TrackRow, compute_figures
+from posefilter.tracking.tracker import Tracker
 
 
 def make_row(x: float, truth: bool = True, tracked: bool = True) -> TrackRow:
@@ -28,3 +31,13 @@ def test_jitter_is_of_frames_that_follow_each_other() -> None:
     away = make_row(0.0, truth=False, tracked=False)
     rows = [make_row(0.0), make_row(0.001), away, make_row(0.009), make_row(0.01)]
     assert compute_figures(rows, model)["jitter_mm"] == pytest.approx(1)
+
+
+def test_rows_of_a_long_video_keep_no_belief() -> None:
+    result = Tracker(make_toy()[1]).update(RGB, DEPTH, K)
+    row = records.make_row("v", "1", (0, 1, 1), result, None)
+    wanted = np.sqrt(np.diag(result.covariance)).tolist()
+    assert records.describe_row(row)["standard_deviations"] == wanted
+    belief = weakref.ref(result.belief)
+    del result
+    assert belief() is None

@@ -10,6 +10,7 @@ import torch
 from tests.tracking.toy import DEPTH, RGB, SPACE, K, make_toy, walk_pose
 
 import posefilter
+from posefilter.confidence.apparent_size import ApparentSize
 from posefilter.confidence.belief_scale import BeliefScale
 from posefilter.confidence.calibration import Calibration, Logistic, tabulate_errors
 from posefilter.confidence.conformal import Conformal
@@ -307,6 +308,38 @@ def test_in_doubt_the_network_sees_the_whole_image() -> None:
         sizes.append(max(toy.encoded, default=None))
     assert max(*sizes[0], *sizes[3]) <= 64
     assert sizes[1:3] == [None, (120, 160)]
+
+
+def test_wrong_inputs_are_doubted_beyond_the_first_frame(monkeypatch: pytest.MonkeyPatch) -> None:
+    toy, estimator = make_toy()
+    scales = [1.25]
+    measured: list[float] = []
+
+    def measure(*_: Any) -> ApparentSize:
+        measured.append(scales[0])
+        return ApparentSize(*torch.tensor([[scales[0]], [20.0], [0.9]]))
+
+    monkeypatch.setattr(toy, "measure_apparent_size", measure)
+    tracker = posefilter.Tracker(estimator, TrackerSettings(window_side=64))
+    toy.truth = walk_pose(1)[0]
+    results = [tracker.update(RGB, DEPTH, K) for _ in range(9)]
+    assert all(one.wrong_size and one.apparent_size == 1.25 for one in results)
+    assert len(measured) == 3  # at first, and in frames with the whole image
+    scales[0] = math.nan  # what is not known there is what was known
+    assert all(tracker.update(RGB, DEPTH, K).wrong_size for _ in range(4))
+    scales[0] = 1.0
+    assert not [tracker.update(RGB, DEPTH, K) for _ in range(4)][-1].wrong_size
+    count = len(measured)
+    assert [tracker.update(RGB, DEPTH, K).apparent_size for _ in range(5)] == [1.0] * 5
+    assert len(measured) == count  # not where nothing is wrong
+    scales[0], toy.truth = 0.7, None
+    lost = [tracker.update(RGB, DEPTH, K) for _ in range(6)][-1]
+    toy.truth = walk_pose(1)[0]
+    found = [tracker.update(RGB, DEPTH, K) for _ in range(4)]
+    assert (lost.status, found[-1].status) == ("lost", "tracked")
+    assert found[-1].apparent_size == pytest.approx(0.7)
+    tracker.reset()
+    assert tracker.tracks[0].apparent_size is None
 
 
 def test_later_frames_may_be_covered_and_cameras_be_of_any_kind() -> None:

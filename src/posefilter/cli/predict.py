@@ -422,16 +422,20 @@ def read_intrinsics(typed: Any, distorted: bool = False) -> CameraFile:
 def _read_camera(path: Path, distorted: bool) -> CameraFile:
     """Return a file's camera.  Raises UserError where it must be said whether images are raw."""
     camera = read_camera_file(path)
-    if camera.distortion and not distorted:
-        raw = f"intrinsics={_list_numbers(camera.K)} distortion=" + ",".join(
-            f"{one:g}" for one in camera.distortion
-        )
-        better = camera.K if camera.rectified is None else camera.rectified
-        raise UserError(
-            f"intrinsics={path}: tells a distortion of the lens; of rectified images type "
-            f"intrinsics={_list_numbers(better)}, of raw ones {raw}"
-        )
-    return camera
+    if not camera.distortion or (distorted and not camera.other_model):
+        return camera
+    raw = f"of raw ones intrinsics={_list_numbers(camera.K)} distortion=" + ",".join(
+        f"{one:g}" for one in camera.distortion
+    )
+    kind = "distortion"
+    if camera.other_model:
+        kind = f"distortion ({camera.other_model})"
+        raw = "raw ones rectify before: distortion= is OpenCV's k1,k2,p1,p2,k3 and no other"
+    better = camera.K if camera.rectified is None else camera.rectified
+    raise UserError(
+        f"intrinsics={path}: tells a {kind} of the lens; of rectified images type "
+        f"intrinsics={_list_numbers(better)}, {raw}"
+    )
 
 
 def _list_numbers(K: np.ndarray) -> str:

@@ -35,7 +35,13 @@ from posefilter.meshes.ycb import number_objects
 from posefilter.metrics.bop_results import write_poses_csv
 from posefilter.progress import bars
 from posefilter.tracking.motion import ConstantVelocity
-from posefilter.tracking.records import compute_figures, describe_row, make_row, write_rows
+from posefilter.tracking.records import (
+    TrackSummary,
+    compute_figures,
+    describe_row,
+    make_row,
+    write_rows,
+)
 from posefilter.tracking.settings import FilterSettings, TrackerSettings
 from posefilter.tracking.track import TrackResult
 from posefilter.tracking.tracker import Tracker
@@ -197,7 +203,7 @@ def read_frame(video: Video, index: int, tracker: Tracker) -> VideoFrame | None:
     return frame
 
 
-def _say_all_lost(name: str, results: Sequence[TrackResult], cfg: DictConfig) -> None:
+def _say_all_lost(name: str, results: Sequence[TrackSummary], cfg: DictConfig) -> None:
     """Say why, where an object is lost in every frame and its guesses are implausible."""
     if not results or any(one.is_tracked for one in results):
         return

@@ -15,7 +15,11 @@ _PAIRS = (("cx", "cy"), ("ppx", "ppy"))  # of the principal point
 _MATRICES = ("camera_matrix", "intrinsic_matrix", "cam_K", "K", "k")
 _INNER = ("intrinsic", "intrinsics", "camera", "depth_intrinsics", "color_intrinsics")
 _DISTORTIONS = ("distortion_coefficients", "coeffs", "dist_coeffs", "distortion", "D", "d")
+_NAMES = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")  # of coefficients, in OpenCV's order
 _PROJECTIONS = ("projection_matrix", "P", "p")
+_MODELS = ("distortion_model", "model")  # keys of the kind of distortion
+# kinds that are OpenCV's polynomial, as `distortion=` takes it
+_POLYNOMIALS = ("", "none", "plumb_bob", "rational_polynomial", "brown_conrady", "radtan", "opencv")
 _SIZES = (("width", "height"), ("image_width", "image_height"), ("w", "h"))
 
 
@@ -25,6 +29,7 @@ class CameraFile(NamedTuple):
     K: np.ndarray  # camera matrix (3, 3), float64 [px]
     size: tuple[int, int] | None = None  # height and width of its images [px], if they are told
     distortion: tuple[float, ...] = ()  # of its lens, in OpenCV's order
+    other_model: str = ""  # the distortion's kind, where that is not OpenCV's polynomial
     rectified: np.ndarray | None = None  # (3, 3) of its rectified images, where the file has one
 
 
@@ -59,8 +64,8 @@ def _of_mapping(content: Any, path: Path) -> CameraFile:
     inner = (content[key] for key in _INNER if isinstance(content.get(key), Mapping))
     for one in (content, *inner):
         K = _find_matrix(one, path)
-        if K is not None:
-            return _of_camera(one, K, path)
+        if K is not None:  # size and distortion may be beside the inner mapping
+            return _of_camera({**content, **one}, K, path)
     images = [one for one in content.values() if isinstance(one, Mapping) and "cam_K" in one]
     if images and len(images) == len(content):
         cameras = np.stack([numbers(one, "cam_K", path, (3, 3)) for one in images])
@@ -79,11 +84,36 @@ def _of_camera(content: Mapping[str, Any], K: np.ndarray, path: Path) -> CameraF
             size = (whole_number(content, height, path), whole_number(content, width, path))
             break
     distortion = _listed(content, _DISTORTIONS)
-    coefficients = () if distortion is None else _flat(distortion["data"], path)
+    if distortion is None:
+        coefficients = _find_named(content, path)
+    else:
+        coefficients = _flat(distortion["data"], path)
     projection = _listed(content, _PROJECTIONS)
     P = None if projection is None else numbers(projection, "data", path, (3, 4))
     rectified = None if P is None or P[0, 0] <= 0 else P[:, :3]
-    return CameraFile(K, size, coefficients if any(coefficients) else (), rectified)
+    if not any(coefficients):
+        return CameraFile(K, size, rectified=rectified)
+    return CameraFile(K, size, coefficients, _find_other_model(content), rectified)
+
+
+def _find_named(content: Mapping[str, Any], path: Path) -> tuple[float, ...]:
+    """Return the coefficients of a distortion that are told one by one, () where none is."""
+    inner = (content[key] for key in _DISTORTIONS if isinstance(content.get(key), Mapping))
+    for one in (content, *inner):
+        if "k1" in one:
+            own = {name: one.get(name, 0.0) for name in _NAMES}
+            found = tuple(float(numbers(own, name, path, ())) for name in _NAMES)
+            return found if any(found[5:]) else found[:5]
+    return ()
+
+
+def _find_other_model(content: Mapping[str, Any]) -> str:
+    """Return the kind of distortion that a mapping tells, "" where it is OpenCV's polynomial, or
+    not told.
+    """
+    told = next((str(content[key]) for key in _MODELS if content.get(key) is not None), "")
+    plain = told.lower().removeprefix("distortion.").replace(" ", "_")  # as RealSense's tools do
+    return "" if plain in _POLYNOMIALS else told
 
 
 def _find_matrix(content: Mapping[str, Any], path: Path) -> np.ndarray | None:

@@ -10,8 +10,8 @@ from posefilter.errors import UserError
 from posefilter.meshes.atlas import merge_materials
 from posefilter.meshes.glb import check_glb
 from posefilter.meshes.mesh import Mesh, creased_normals, looks_inward
-from posefilter.meshes.obj import PLAIN, Material, RawMesh, read_image, read_obj
-from posefilter.meshes.ply import open_ply
+from posefilter.meshes.obj import BRIGHTEST, PLAIN, Material, RawMesh, read_image, read_obj
+from posefilter.meshes.ply import COLORS, open_ply
 
 SUFFIXES = (".obj", ".ply", ".glb")
 _FARTHEST = 1e6  # [m]
@@ -147,7 +147,14 @@ def _load_ply(path: Path) -> Any:
     for name in textures:
         read_image(path.parent / name, path)
     resolver = trimesh.resolvers.FilePathResolver(str(path))
-    return trimesh.load(file, file_type="ply", process=False, resolver=resolver)
+    loaded: Any = trimesh.load(file, file_type="ply", process=False, resolver=resolver)
+    for element in loaded.metadata.get("_ply_raw", {}).values():
+        data = element.get("data", {})
+        names = data if isinstance(data, dict) else data.dtype.names or ()
+        for name in COLORS & {*names}:  # trimesh would cut them off at 1
+            if data[name].dtype.kind == "f" and data[name].max(initial=0.0) > BRIGHTEST:
+                raise UserError(f"{path}: colors of floats above 1; write them in 8 bits")
+    return loaded
 
 
 def _from_trimesh(mesh: trimesh.Trimesh, path: Path) -> RawMesh:

@@ -20,6 +20,8 @@ _MOST_NODES = 10_000
 _MOST_JSON = 1 << 24  # [bytes]
 # extensions that change neither the shape nor the picture on it
 _HARMLESS = {"KHR_materials_unlit", "KHR_materials_specular", "KHR_materials_ior"}
+# those that change it without being required
+_CHANGING = {"KHR_texture_transform", "EXT_mesh_gpu_instancing"}
 _FAN, _FLOAT, _USHORT = 6, 5126, 5123  # a kind of primitive, and kinds of numbers
 _DEEPEST = 100  # nodes within each other
 _JSON, _BINARY = 0x4E4F534A, 0x004E4942  # kinds of chunks
@@ -61,9 +63,14 @@ def _chunks(data: bytes) -> Iterator[tuple[int, bytes]]:
 def _check_extensions(content: Mapping[str, Any], path: Path) -> None:
     """Refuse what the reader would leave out without a word."""
     needed = set(content.get("extensionsRequired", ())) - _HARMLESS
-    moved = {"KHR_texture_transform"} & set(content.get("extensionsUsed", ()))
+    moved = _CHANGING & set(content.get("extensionsUsed", ()))
     for name in sorted(needed | moved):
         raise UserError(f"{path}: uses {name}, which is not read; export it without")
+    shown = (*content.get("nodes", []), *content.get("meshes", []))
+    if any(any(one.get("weights", ())) for one in shown):
+        raise UserError(f"{path}: has a shape key that is on, which is not read; apply it first")
+    if any("skin" in node for node in content.get("nodes", [])):
+        raise UserError(f"{path}: is posed by a skeleton, which is not read; apply it first")
 
 
 def _check_counts(content: Mapping[str, Any], path: Path) -> None:

@@ -21,7 +21,7 @@ class Material(NamedTuple):
 
 
 PLAIN = Material(np.full(3, 0.7), None)
-_BRIGHTEST = 2.0  # of colors in [0, 1], as exporters that round or light them write
+BRIGHTEST = 2.0  # of colors in [0, 1], as exporters that round or light them write
 MOST_TEXELS = 1 << 28  # pixels of all textures of a mesh
 
 
@@ -55,7 +55,8 @@ def read_image(path: Path, source: Path) -> np.ndarray:
         raise UserError(f"{path}: missing texture, named by {source.name}")
     data = read_bytes(path)
     check_picture(path, data)
-    image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
+    as_stored = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION  # as of PLY and GLB
+    image = cv2.imdecode(np.frombuffer(data, np.uint8), as_stored)
     if image is None:
         raise UserError(
             f"{path}: not a readable picture (is it cut short?), named by {source.name}"
@@ -104,7 +105,7 @@ def read_obj(path: Path) -> RawMesh:
     polygons: dict[int, list[int]] = {}  # by number of corners: the first triangle of each
     library: dict[str, Material] = {}
     images: dict[Path, np.ndarray] = {}
-    materials: dict[str, int] = {}
+    materials: dict[str | None, int] = {}
     current = 0
     for key, rest in _read_lines(path):
         if key in numbers:
@@ -121,14 +122,16 @@ def read_obj(path: Path) -> RawMesh:
             for file in rest.split() if several else [rest]:
                 library |= _read_mtl(path.parent / file, path, images)
         elif key == "usemtl":
+            if face_material and not materials:  # the faces before have none
+                materials[None] = 0
             current = materials.setdefault(rest, len(materials))
     index = np.array(corners, dtype=np.int64).reshape(-1, 3, 3)  # face, corner, (v, vt, vn)
     vertices = _rectangle(numbers["v"], 3)
     colored = len(numbers["v"]) > 0 and len(numbers["v"][0]) >= 6
     colors = _rectangle(numbers["v"], 6)[:, 3:] if colored else None
-    if colors is not None and colors.max(initial=0.0) > _BRIGHTEST:  # numbers of 8 bits
+    if colors is not None and colors.max(initial=0.0) > BRIGHTEST:  # numbers of 8 bits
         colors = colors / 255
-    unknown = [name for name in materials if name not in library]
+    unknown = [name for name in materials if name is not None and name not in library]
     if unknown and len(numbers["vt"]) and colors is None:
         raise UserError(
             f"{path}: its material '{unknown[0]}' is in no material file (mtllib), so that its "
@@ -136,7 +139,8 @@ def read_obj(path: Path) -> RawMesh:
         )
     # colors of vertices are whole by themselves
     plain = PLAIN if colors is None else PLAIN._replace(color=np.ones(3))
-    known = [library.get(name, plain) for name in materials] or [*library.values(), plain][:1]
+    known = [plain if name is None else library.get(name, plain) for name in materials]
+    known = known or [*library.values(), plain][:1]
     faces = index[..., 0]
     if len(faces) and (faces.min() < 0 or faces.max() >= len(vertices)):
         raise UserError(f"{path}: a face names a vertex that is not there (is the file cut short?)")

@@ -12,7 +12,7 @@ _END = b"end_header"
 _LONGEST = 1 << 20  # of a header [bytes]
 _TEXTURE = re.compile(r"comment\s+texturefile\s+(.+)", re.IGNORECASE)
 _PROPERTY = re.compile(r"^(\s*property\s+.*\s)(\w+)(\s*)$", re.MULTILINE)
-_COLORS, _WIDE = ("red", "green", "blue"), ("h", "H")
+COLORS, _WIDE = {"red", "green", "blue"}, ("h", "H")
 _COORDINATES = ("texture_u", "texture_v", "u", "v", "s", "t", "texcoord")
 
 
@@ -48,7 +48,7 @@ def open_ply(path: Path) -> tuple[io.BytesIO, list[str]]:
     elements = list(list_elements(header))
     properties = [one for element in elements for one in element.properties]
     names = {one.name for one in properties}
-    if any(one.name in _COLORS and one.kind in _WIDE for one in properties):
+    if any(one.name in COLORS and one.kind in _WIDE for one in properties):
         raise UserError(f"{path}: colors of 16 bits, which are not read; write them in 8")
     if re.search(r"^format\s+ascii", header, re.MULTILINE):
         rows = sum(element.rows for element in elements)

@@ -328,8 +328,8 @@ class BagWriter:
         topic: Where detections go.
 
     Raises:
-        UserError: The path already exists, or another process is about to write it, or the topic's
-            name is none.
+        UserError: The path already exists, is another kind of bag's, or another process is about to
+            write it; or the topic's name is none.
     """
 
     def __init__(self, path: Path, topic: str) -> None:
@@ -337,6 +337,8 @@ class BagWriter:
 
         if path.exists():
             raise UserError(f"out={path}: already exists; choose another")
+        if path.suffix in (".db3", ".bag"):
+            raise UserError(f"out={path}: bags are written as MCAP; name an .mcap file or a folder")
         if not _NAME.fullmatch(topic):
             raise UserError(f"detections={topic}: is no name of a topic, such as /detections")
         self.path, self.topic = path, topic
@@ -392,11 +394,15 @@ class BagWriter:
                 )
             kind = (one.topic, one.msgtype, one.ext)
             same = next((copy for other, copy in added if other == kind), None)
+            types = open_types()
+            # SQLite bags of Humble have no definitions, which viewers of MCAP need
+            known = not one.msgdef.data and one.msgtype in types.fielddefs
             self.copies[one.id] = same or self.writer.add_connection(
                 one.topic,
                 one.msgtype,
-                msgdef=one.msgdef.data,
-                rihs01=one.digest or "RIHS01_",
+                typestore=types,
+                msgdef=None if known else one.msgdef.data,
+                rihs01=None if known else one.digest or "RIHS01_",
                 serialization_format=one.ext.serialization_format,
                 offered_qos_profiles=one.ext.offered_qos_profiles,
             )

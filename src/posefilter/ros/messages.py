@@ -105,7 +105,8 @@ def _decode_compressed_color(message: Any, topic: str) -> np.ndarray:
     data, path = bytes(message.data), Path(f"color={topic}")
     if own in _BAYER and packed.split()[-1:] == ["compressed"]:  # the mosaic itself
         return np.asarray(cv2.cvtColor(decode_image(data, path, cv2.IMREAD_GRAYSCALE), _BAYER[own]))
-    return np.ascontiguousarray(decode_image(data, path, cv2.IMREAD_COLOR)[..., ::-1])
+    as_stored = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION  # as depth and camera_info are
+    return np.ascontiguousarray(decode_image(data, path, as_stored)[..., ::-1])
 
 
 def decode_depth(message: Any, topic: str, units: float = 1000.0) -> np.ndarray:

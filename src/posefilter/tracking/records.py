@@ -4,6 +4,7 @@ import csv
 import json
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass, fields
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -24,6 +25,24 @@ _COLUMNS = (
 )  # fmt: skip
 
 
+@dataclass(frozen=True, slots=True)
+class TrackSummary:
+    """What is kept of a `TrackResult`: the beliefs of an hour's video would fill the memory."""
+
+    object: str
+    pose: np.ndarray  # (4, 4) camera_from_object [m]
+    status: str
+    is_tracked: bool
+    score: float
+    probability: float | None
+    presence: float | None
+    objectness: float
+    particles: int
+    seconds: float
+    warnings: tuple[str, ...]
+    standard_deviations: list[float]  # as of `Belief.covariance` [m, rad]
+
+
 class TrackRow(NamedTuple):
     """One object in one frame."""
 
@@ -32,7 +51,7 @@ class TrackRow(NamedTuple):
     scene_id: int
     im_id: int
     obj_id: int
-    result: TrackResult
+    result: TrackSummary
     truth: np.ndarray | None  # (4, 4) camera_from_object [m], where it is known
     add: float  # error of the pose [m]; NaN without a truth
     add_s: float
@@ -47,7 +66,14 @@ def make_row(
         pair = (torch.from_numpy(result.pose)[None], torch.from_numpy(truth).double()[None])
         points = result.object_model.points.cpu()
         errors = (float(add(*pair, points.double())), float(add_s(*pair, points)))
-    return TrackRow(video, frame, *ids, result, truth, *errors)
+    return TrackRow(video, frame, *ids, summarize_result(result), truth, *errors)
+
+
+def summarize_result(result: TrackResult) -> TrackSummary:
+    """Return what is kept of a result."""
+    deviations = np.sqrt(np.diag(result.covariance)).tolist()
+    own = {one.name: getattr(result, one.name) for one in fields(TrackSummary)[:-1]}
+    return TrackSummary(**own, standard_deviations=deviations)
 
 
 def compute_figures(rows: Sequence[TrackRow], object_model: ObjectModel) -> dict[str, Any]:
@@ -129,7 +155,7 @@ def describe_row(row: TrackRow) -> dict[str, Any]:
         "status": result.status,
         "camera_from_object": result.pose.tolist(),
         **{name: getattr(result, name) for name in measured},
-        "standard_deviations": np.sqrt(np.diag(result.covariance)).tolist(),
+        "standard_deviations": result.standard_deviations,
         "add_mm": 1000 * row.add,
         "add_s_mm": 1000 * row.add_s,
         "seconds": result.seconds,

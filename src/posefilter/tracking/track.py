@@ -92,6 +92,7 @@ class TrackSnapshot(NamedTuple):
     state: State | None
     loss_detector: TrackLossDetector
     frames: int
+    apparent_size: ApparentSize | None
 
 
 class FrameEstimate(NamedTuple):
@@ -102,7 +103,7 @@ class FrameEstimate(NamedTuple):
     objectness: float = 0.0  # the mean objectness of the pixels that the estimate covers
     presence: float = 0.0  # what the track is judged by
     found: Assessment | None = None  # the calibrated probabilities
-    size: ApparentSize | None = None  # of estimates from the whole image
+    size: ApparentSize | None = None  # where it was measured
 
 
 class Track:
@@ -151,17 +152,20 @@ class Track:
         self.state: State | None = None
         self.loss_detector = TrackLossDetector(self.settings)
         self.frames = 0
+        self.apparent_size: ApparentSize | None = None  # as last measured
 
     @property
     def snapshot(self) -> TrackSnapshot:
         """What the next frame depends on."""
         random = self.generator.get_state()
-        return TrackSnapshot(random, self.state, self.loss_detector, self.frames)
+        return TrackSnapshot(
+            random, self.state, self.loss_detector, self.frames, self.apparent_size
+        )
 
     @snapshot.setter
     def snapshot(self, snapshot: TrackSnapshot) -> None:
         self.generator.set_state(snapshot.random)
-        self.state, self.loss_detector, self.frames = snapshot[1:]
+        self.state, self.loss_detector, self.frames, self.apparent_size = snapshot[1:]
 
     @property
     def estimated_cost(self) -> float:
@@ -191,6 +195,10 @@ class Track:
         else:
             sight = self._follow(batch, predicted, windowed=window is not None)
         trusted, status = self.loss_detector.judge(sight.presence)
+        self.apparent_size = self.apparent_size if sight.size is None else sight.size
+        if status != LOST and sight.belief is not None:
+            # inputs that are wrong stay so in frames that do not measure it
+            sight = sight._replace(size=self.apparent_size)
         belief = sight.belief if trusted or predicted is None else None
         self.state = self._correct(predicted, belief, status)
         self.frames += 1
@@ -246,13 +254,18 @@ class Track:
         encoding, start = self.method.encode(batch), predicted.belief.state
         turns = [RotateTogether(one) for one in self._texture_rotations if self._texture_is_due]
         refine = self._refine(settings.quadratic_fits, turns)
-        return self._filter(batch, encoding, start, follow, refine, against)
+        found, trace = self._filter(batch, encoding, start, follow, refine, against)
+        if not windowed and self._has_wrong_size:  # the inputs may be right now, or have been
+            size = self.method.measure_apparent_size(trace, batch)
+            if size is not None and bool(size.scale.isfinite().all()):
+                return found._replace(size=size)
+        return found
 
     def _search(self, batch: Batch, predicted: State) -> FrameEstimate:
         """Probe the whole image for a lost object, and search where that is worth it."""
         settings, encoding = self.settings, self.method.encode(batch)
         start = predicted.belief.state
-        probed = self._filter(batch, encoding, start, settings.probe, self._refine(0))
+        probed, _ = self._filter(batch, encoding, start, settings.probe, self._refine(0))
         if probed.presence < settings.search_above and not self._search_is_due:
             return probed
         assert probed.belief is not None
@@ -261,7 +274,8 @@ class Track:
         start = inherit(begun.state, drawn)
         # as in a single image: the frame before does not tell how the object is turned
         refine = self._refine(settings.quadratic_fits, self._texture_rotations)
-        return self._filter(batch, encoding, start, search, refine)
+        found, trace = self._filter(batch, encoding, start, search, refine)
+        return found._replace(size=self.method.measure_apparent_size(trace, batch))
 
     def _filter(
         self,
@@ -271,7 +285,7 @@ class Track:
         filter_settings: FilterSettings,
         refine: Refine,
         against: float = 0.0,
-    ) -> FrameEstimate:
+    ) -> tuple[FrameEstimate, Trace]:
         """Run a filter from poses (1, N, 4, 4), and proposals with log odds `against` them."""
         particles = min(start.shape[1], 2 * filter_settings.min_particles)
         filter = ParticleFilter(
@@ -287,7 +301,8 @@ class Track:
         )
         pixels, proposals = filter_settings.pixels, filter_settings.proposals
         scorer = FrameScorer(self.method, encoding, pixels, proposals, against)
-        return self._weigh(batch, filter(batch, scorer, self.generator))
+        trace = filter(batch, scorer, self.generator)
+        return self._weigh(batch, trace), trace
 
     def _refine(self, quadratic_fits: int, turns: Sequence[Refine] = ()) -> Refine:
         """Return what improves a frame's estimate: the likelihood, then the measured depth, then
@@ -356,6 +371,10 @@ class Track:
     def _search_is_due(self) -> bool:
         every = self.settings.search_every
         return every > 0 and self._probes[0] % every == 0
+
+    @property
+    def _has_wrong_size(self) -> bool:
+        return self.apparent_size is not None and bool(self.apparent_size.contradicts().any())
 
     @property
     def _whole_is_due(self) -> bool:

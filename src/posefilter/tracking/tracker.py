@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from posefilter.devices import take_threads
 from posefilter.errors import UserError, check_seed
 from posefilter.estimator import Estimator, get_trained_size
 from posefilter.images import Images, as_array, check_depth_unit, check_images, check_intrinsics
@@ -109,6 +110,7 @@ class Tracker:
     def update_all(self, rgb: Any, depth: Any, intrinsics: Any) -> list[TrackResult]:
         """Find each object in the next frame; as `update`, but always a list."""
         frame = Frame(self.check(rgb, depth, intrinsics))
+        take_threads()
         if self._others is not None:
             return self._others.update(frame)
         return [track.update(frame) for track in self.tracks]
