@@ -124,6 +124,8 @@ def check_ablations(arguments: Sequence[str], conf: Path) -> None:
     variant than the one that is typed, which would win.
     """
     typed = dict(a.split("=", 1) for a in arguments if "=" in a)
+    if "ablation" not in typed:
+        return
     if "experiment" not in typed:  # which may set the method
         settings = yaml.safe_load((conf / "train.yaml").read_text(encoding="utf-8"))
         usual = next(one["model"] for one in settings["defaults"] if "model" in one)
