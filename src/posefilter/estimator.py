@@ -39,7 +39,7 @@ class Estimator:
             diameters.
 
     Raises:
-        UserError: There is no method, or one that detects and estimates no pose.
+        UserError: They are no list of methods, or one detects and estimates no pose.
     """
 
     def __init__(
@@ -49,6 +49,12 @@ class Estimator:
         costs: Costs | None = None,
         pose_tolerance: PoseTolerance | None = None,
     ) -> None:
+        if not isinstance(methods, (list, tuple)) or not all(
+            hasattr(method, "capabilities") for method in methods
+        ):
+            raise UserError(
+                "an estimator needs a list of methods; posefilter.load makes one of a file"
+            )
         if not methods:
             raise UserError("an estimator needs the weights of one object at least")
         for method in methods:

@@ -64,6 +64,8 @@ def test_a_score_is_the_probability_where_there_is_one() -> None:
     assert choose_score(0.25, 7.5) == 0.25
     assert choose_score(0.0, 7.5) == 0
     assert choose_score(None, 7.5) == choose_score(np.nan, 7.5) == 7.5
+    # of a frame that shows nothing, whose pose a track predicts
+    assert choose_score(None, -np.inf) == 0
 
 
 def test_header_may_be_missing_and_numbers_plain(tmp_path: Path) -> None:

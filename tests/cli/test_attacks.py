@@ -237,3 +237,12 @@ def test_an_export_overwrites_nothing(tmp_path: Path, capfd: pytest.CaptureFixtu
 
 def test_a_closed_pipe_is_told_as_one() -> None:
     assert "what it prints to was closed" in explain(BrokenPipeError(32, "x"), "track", HOME, [])
+
+
+def test_what_a_preset_sets_for_another_choice_can_be_left_out() -> None:
+    """Its number is one that the user has not typed."""
+    error = UserError("model.net.hidden: LatentNet takes no such setting")
+    typed = ["model=cnn_patch", "model/net=latent"]
+    told = explain(error, "train", HOME / "conf", typed)
+    assert told == f"{error}; '~model.net.hidden' leaves it out"
+    assert explain(error, "train", HOME / "conf", [*typed, "model.net.hidden=9"]) == str(error)

@@ -10,6 +10,7 @@ from tests.cli.conftest import Cold
 from tests.models.toy import square
 
 from posefilter.capabilities import MEANINGS, Declared, find_missing, read_declared
+from posefilter.cli.choices import check_choices
 from posefilter.cli.command import compose_job
 from posefilter.cli.fit import check_fit, read_attribute
 from posefilter.cli.instantiate import locate
@@ -154,3 +155,32 @@ def test_what_each_name_obliges_to_is_written_down() -> None:
     text = (CONF.parent / "docs" / "architecture.md").read_text()
     table = text.split("## Capabilities")[1]
     assert set(re.findall(r"^\| `(\w+)` \|", table, re.MULTILINE)) == set(MEANINGS)
+
+
+@pytest.mark.parametrize(
+    ("typed", "told"),
+    [
+        ("ablation=c1_normalization", "is a step of model=patch_pf or .*, not of model=pose_pf"),
+        ("model=pose_pf ablation=s1_glimpse", "is a step of .*, not of model=pose_pf"),
+        ("model=patch_pf ablation=box_c11_votes", "of model=cnn_patch or downsized, not of"),
+        ("model=cnn_patch ablation=paper,pose_c14_fragments", "of model=patch_pf or pixel_pf, not"),
+        ("model=downsized ablation=pose_pf_c2_network", "is a step of model=pose_pf, not of"),
+        (
+            "model=patch_pf ablation=c3_bounded variant=working",
+            "from variant=paper; leave variant=",
+        ),
+        ("model=patch_pf variant=paper,working ablation=m9_context", "from variant=working; leave"),
+    ],
+)
+def test_a_step_between_variants_is_of_a_method_and_of_a_variant(typed: str, told: str) -> None:
+    with pytest.raises(UserError, match=told):
+        check_choices(typed.split(), CONF, "train")
+
+
+@pytest.mark.parametrize(
+    "typed",
+    ["", "variant=paper", "experiment=cracker_box_pixels", "model=my_own", "model=cnn_patch"],
+)
+def test_a_step_that_fits_is_none_of_them(typed: str) -> None:
+    name = "box_c11_votes" if typed == "model=cnn_patch" else "paper"
+    check_choices([*typed.split(), f"ablation={name}"], CONF, "train")

@@ -133,6 +133,25 @@ def test_each_modification_is_one_choice(model: str, change: str, tmp_path: Path
     assert trace.belief.best.isfinite().all()
 
 
+def test_a_detector_may_have_a_latent(tmp_path: Path) -> None:
+    losses = step(build(tmp_path, "model=cnn_patch", "variant=paper", "model/net=latent"))
+    assert {*losses} == {"loss"}
+
+
+@pytest.mark.parametrize("model", ["patch_pf", "downsized"])
+def test_the_displacement_alone_is_learned_where_the_schedule_says_so(
+    model: str, tmp_path: Path
+) -> None:
+    alone = "loss/schedule=displacement_only"
+    losses = step(build(tmp_path, f"model={model}", "loss=bce", alone))
+    taught = {name for name, value in losses.items() if bool(value.any())}
+    assert taught == {"displacement"} < {*losses}
+    stages = build(tmp_path, f"model={model}", "loss=bce", "loss/schedule=three_stages")
+    off = stages.loss_schedule[1].loss_weights
+    assert {*losses} - {"displacement"} <= {*off}
+    assert not any(off.values())
+
+
 def test_the_margin_of_the_displacement_scales_with_the_image(tmp_path: Path) -> None:
     margins = {
         model: build(tmp_path, f"model={model}").aux_losses["displacement"].loss.label.margin_px

@@ -130,6 +130,13 @@ def test_defaults_pass(composed: dict[str, DictConfig]) -> None:
         check_settings(cfg, name)
 
 
+def test_the_folder_of_a_run_is_given_as_out(composed: dict[str, DictConfig]) -> None:
+    cfg = composed["train"].copy()
+    OmegaConf.update(cfg, "folder", "mine")
+    with pytest.raises(UserError, match=r"^folder=mine: is set by the run; choose .* out=$"):
+        check_settings(cfg, "train")
+
+
 @pytest.mark.parametrize(("command", "key", "value"), CASES)
 def test_a_value_that_makes_no_sense_is_named(
     command: str, key: str, value: Any, composed: dict[str, DictConfig]

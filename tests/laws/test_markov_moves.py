@@ -32,6 +32,7 @@ class TwoModes:
     def score_poses(
         self, encoding: Any, poses: Tensor, sigma: float, generator: Generator, pixels: int
     ) -> Tensor:
+        assert poses.numel()  # networks need not take none
         far = (origin_of(poses, CENTER) - CENTER).square().sum(-1) / SHIFT**2
         modes = torch.stack([torch.eye(3).double(), HALF])
         angle = angle_between(rotation_of(poses)[..., None, :, :], modes) / TURN

@@ -186,6 +186,14 @@ def test_what_is_no_belief_is_refused_in_one_line(tmp_path: Path) -> None:
         Belief(good, np.ones(3), CENTER, RADIUS, DIAMETER)
     with pytest.raises(UserError, match=r"\(N, 4, 4\)"):
         Belief(good, np.ones(2) / 2, CENTER, RADIUS, DIAMETER)
+    for weights in (1.0, None):
+        with pytest.raises(UserError, match=r"\(N, 4, 4\)"):
+            Belief(good, weights, CENTER, RADIUS, DIAMETER)  # type: ignore[arg-type]
+    learned = torch.from_numpy(good).requires_grad_()
+    with pytest.raises(UserError, match="samples should be numbers"):
+        Belief(learned, np.ones(3) / 3, CENTER, RADIUS, DIAMETER)  # type: ignore[arg-type]
+    with pytest.raises(UserError, match="first 2 samples are draws, and have no weight"):
+        Belief(good, np.array([0.0, 0.0, 1.0]), CENTER, RADIUS, DIAMETER, draws=2)
 
 
 def test_a_particle_without_weight_is_no_mode() -> None:

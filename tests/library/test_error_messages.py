@@ -15,6 +15,12 @@ def test_a_reason_is_the_first_line_or_the_class() -> None:
     assert find_reason(ValueError("")) == "ValueError"
 
 
+@pytest.mark.parametrize("wrong", [3, "003_cracker_box", ["003_cracker_box"], None])
+def test_an_estimator_of_something_else_names_load(wrong: Any) -> None:
+    with pytest.raises(UserError, match=r"needs a list of methods; posefilter\.load makes one"):
+        Estimator(wrong)
+
+
 def test_a_device_that_fails_without_a_message_is_refused() -> None:
     def fail(device: str) -> None:
         raise AssertionError

@@ -143,6 +143,11 @@ def resampling(change: Any) -> Any:
     return type("Tempered", (Resample,), {"change": staticmethod(change)})()
 
 
+def mixture_of(resampled: Any) -> Tensor:
+    """Return the mixtures that children of 16 particles are, each its ancestor alone."""
+    return torch.nn.functional.one_hot(resampled.ancestors, 16).float()
+
+
 class Walk(Gaussian):
     change: Any = staticmethod(lambda old, new: new)
 
@@ -205,6 +210,10 @@ PARTS = {
     "weights": (
         {"resample": resampling(lambda r: r._replace(log_weights=r.log_weights.exp()))},
         "Tempered: the weights of the resampled particles sum to",
+    ),
+    "mixture": (
+        {"resample": resampling(lambda r: r._replace(mixture_weights=2 * mixture_of(r)))},
+        "Tempered: mixture_weights are no weights: a child's should sum to 1",
     ),
     "moved shape": (
         {"propagate": walking(lambda old, new: new[..., :1])},

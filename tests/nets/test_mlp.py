@@ -88,6 +88,14 @@ def test_the_kernel_decides_what_a_convolution_sees(kernel: int) -> None:
         PatchNet(0, 9, kernel=4)
 
 
+def test_a_latent_net_without_a_pose_learns() -> None:
+    net = LatentNet(0, 1, pose_width=0, latent_width=8, width=16, normalization="layer")
+    out = net(torch.rand(1, 3, 4, 1, 1), torch.zeros(1, 3, 0), torch.zeros(1, 3, 8))
+    assert out.pose.shape == (1, 3, 0)
+    (out.logit.sum() + out.displacement.sum()).backward()
+    assert all(p.grad is not None for p in net.parameters())
+
+
 def test_latent_net_remembers() -> None:
     torch.manual_seed(0)
     net = LatentNet(0, 1, latent_width=8, pose_width=9, width=16, normalization="layer")

@@ -67,6 +67,15 @@ def test_some_packages_cannot_be_plug_ins(name: str, package: str) -> None:
     assert trust.trusted() == {*trust.installed()}
 
 
+@pytest.mark.parametrize("name", ["my_plugni", "nowhere_at_all.inside", "my_plugin.nothing"])
+def test_a_package_that_is_not_there_is_told_at_once(name: str, package: str) -> None:
+    with pytest.raises(UserError, match=f"^plugins={name}: there is no package '{name}'"):
+        trust.trust(name)
+    trust.trust("my_plugin.pieces")
+    assert trust.named() == {"my_plugin.pieces"}
+    assert "my_plugin.pieces" not in sys.modules
+
+
 def test_an_installed_entry_point_is_trusted(package: str, monkeypatch: pytest.MonkeyPatch) -> None:
     class Point:
         name, value = "own", "my_plugin"

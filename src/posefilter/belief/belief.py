@@ -81,7 +81,7 @@ class Belief:
         """
         for name in ("samples", "weights", "center", "symmetries"):
             object.__setattr__(self, name, _as_numbers(name, getattr(self, name)))
-        count = len(self.weights)
+        count = self.weights.size
         if self.samples.shape != (count, 4, 4) or self.weights.shape != (count,) or not count:
             raise UserError(
                 f"belief: samples {self.samples.shape} and weights {self.weights.shape} should be "
@@ -104,6 +104,8 @@ class Belief:
             raise UserError(f"belief: the center should be three numbers, not {self.center}")
         if not isinstance(self.draws, Integral) or not 0 <= self.draws <= count:
             raise UserError(f"belief: {self.draws} of its {count} samples cannot be draws")
+        if self.draws and not self.weights[: self.draws].any():
+            raise UserError(f"belief: its first {self.draws} samples are draws, and have no weight")
         for name in ("radius", "diameter"):
             size = _as_numbers(f"the {name}", getattr(self, name))
             if size.ndim or not 0 < size < np.inf:
@@ -496,7 +498,7 @@ def _as_numbers(name: str, value: Any) -> np.ndarray:
     """Return numbers as a float64 array of its own, which stays what it is if theirs changes."""
     try:
         return np.array(value, dtype=np.float64, order="C")
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, RuntimeError) as error:  # torch's, of a tensor with a gradient
         raise UserError(f"belief: {name} should be numbers in an array ({error})") from error
 
 

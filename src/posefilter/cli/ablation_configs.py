@@ -15,6 +15,7 @@ from posefilter.cli.ablations import (
     BY_NAME,
     SIZE,
     Ablation,
+    find_variant,
     list_detector_ablations,
     list_pose_ablations,
     list_pose_space_ablations,
@@ -31,7 +32,7 @@ def resolve_overrides(ablation: Ablation) -> tuple[str, dict[str, str]]:
     while not chain[0].parent.startswith("variant="):
         chain.insert(0, BY_NAME[chain[0].parent])
     pairs = [override.partition("=") for step in chain for override in step.overrides]
-    return chain[0].parent.partition("=")[2], {key: value for key, _, value in pairs}
+    return find_variant(ablation), {key: value for key, _, value in pairs}
 
 
 def make_node(ablation: Ablation) -> dict[str, Any]:

@@ -229,6 +229,28 @@ _NOT_OF_DETECTORS = (
     "c3_bounded", "c4_balanced", "c5_displacement_loss",
 )  # fmt: skip
 BY_NAME = {ablation.name: ablation for ablation in ABLATIONS}
+_WITH_POSE, _DETECTORS, _POSE_SPACE = (
+    ("patch_pf", "pixel_pf"),
+    ("cnn_patch", "downsized"),
+    "pose_pf",
+)
+
+
+def list_models(name: str = "paper") -> list[str]:
+    """Return the methods that a row is of, as one types them."""
+    if name.startswith(f"{_POSE_SPACE}_"):
+        return [_POSE_SPACE]
+    pose_space = [] if name not in ("paper", "working") else [_POSE_SPACE]
+    with_pose = [] if name.startswith("box_") else [*_WITH_POSE]
+    detectors = [] if name.startswith("pose_") else [*_DETECTORS]
+    return [*with_pose, *detectors, *pose_space]
+
+
+def find_variant(ablation: Ablation) -> str:
+    """Return the variant that a row, or the first of the rows that it builds on, changes."""
+    while not ablation.parent.startswith("variant="):
+        ablation = BY_NAME[ablation.parent]
+    return ablation.parent.partition("=")[2]
 
 
 def list_pose_ablations() -> list[str]:

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import yaml
 
+from posefilter.cli.ablations import BY_NAME, find_variant, list_models
 from posefilter.cli.instantiate import hint
 from posefilter.cli.plain import key_of
 from posefilter.cli.renamed import rename
@@ -45,6 +46,8 @@ def check_choices(arguments: list[str], conf: Path, command: str | None = None) 
         if now is not None:
             raise UserError(f"{argument}: is now {now}")
     check_variants(arguments, conf)
+    if command == "train":
+        check_ablations(arguments, conf)
     check_names([conf, *find_folders(named()), *config_folders(arguments)])
 
 
@@ -113,6 +116,33 @@ def check_variants(arguments: Sequence[str], conf: Path) -> None:
             raise UserError(
                 f"variant={variant}: model={model} has no such variant; choose "
                 f"variant={' or '.join(known)}"
+            )
+
+
+def check_ablations(arguments: Sequence[str], conf: Path) -> None:
+    """Raise UserError for a step between variants that is another method's, or changes another
+    variant than the one that is typed, which would win.
+    """
+    typed = dict(a.split("=", 1) for a in arguments if "=" in a)
+    if "ablation" not in typed:
+        return
+    if "experiment" not in typed:  # which may set the method
+        settings = yaml.safe_load((conf / "train.yaml").read_text(encoding="utf-8"))
+        usual = next(one["model"] for one in settings["defaults"] if "model" in one)
+        typed = {"model": usual, **typed}
+    keys = ("ablation", "model", "variant")
+    for name, model, variant in product(*(typed.get(key, "").split(",") for key in keys)):
+        if name not in BY_NAME:
+            continue
+        models = list_models(name)
+        if model in list_models() and model not in models:
+            raise UserError(
+                f"ablation={name}: is a step of model={' or '.join(models)}, not of model={model}"
+            )
+        own = find_variant(BY_NAME[name])
+        if variant not in ("", own):
+            raise UserError(
+                f"ablation={name}: is a step from variant={own}; leave variant={variant} out"
             )
 
 

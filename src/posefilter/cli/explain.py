@@ -38,6 +38,8 @@ LIGHTNINGS = (
 _FORMS = {"intrinsics": "fx,fy,cx,cy", "distortion": "k1,k2,p1,p2,k3"}  # of lists of numbers
 # what Hydra says of a choice that is made already, and of a setting that there is
 _THERE = re.compile(r"(?:Multiple values for |.* already at ')(\S+?)(?:\. |')")
+# a setting that a class does not take
+_NOT_TAKEN = re.compile(r"(model\.[\w.]+): \w+ takes no such setting$")
 # choices that packages of others bring
 _EXTRA = ("optuna", "joblib", "submitit_local", "submitit_slurm")
 
@@ -98,6 +100,9 @@ def explain(error: BaseException, name: str, conf: Path, arguments: list[str]) -
         return f"{error.full_key}: is missing; give {error.full_key}=..."
     if isinstance(error, OmegaConfBaseException) and getattr(error, "full_key", None):
         return f"{error.full_key}: {first_line(error)}"
+    if (found := _NOT_TAKEN.match(text)) and found[1] not in map(key_of, arguments):
+        # a preset sets it for another choice
+        return f"{first_line(error)}; '~{found[1]}' leaves it out"
     return first_line(error)
 
 

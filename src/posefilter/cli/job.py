@@ -88,7 +88,11 @@ def run_of(path: Any) -> str:
 
 
 def check_out(cfg: DictConfig) -> None:
-    """Raise UserError where `out` is something that cannot name a folder or file."""
+    """Raise UserError where `out` is something that cannot name a folder or file, or a run's folder
+    is given as `folder`, which the run sets.
+    """
+    if "folder" in cfg:  # not while it is missing
+        raise UserError(f"folder={cfg.folder}: is set by the run; choose a folder by out=")
     out = cfg.get("out")
     named = isinstance(out, str | int | float) and not isinstance(out, bool) and str(out).strip()
     if out is not None and not named:

@@ -82,14 +82,27 @@ def trust(package: str) -> None:
         package: The dotted name of the package; it is not imported yet.
 
     Raises:
-        UserError: The name is none, or one of the standard library, posefilter, torch or lightning.
+        UserError: The name is none, or one of the standard library, posefilter, torch or lightning;
+            or there is no such package.
     """
     parts = package.split(".") if isinstance(package, str) else [""]
     if not all(part.isidentifier() for part in parts):
         raise UserError(f"plugins={package!r}: not the name of a package")
     if not _may_be_plugin(parts[0]):
         raise UserError(f"plugins={package}: only a package of your own can be a plug-in")
+    if not _is_there(package):
+        raise UserError(f"plugins={package}: there is no package '{package}' (is it installed?)")
     _trusted.add(package)
+
+
+def _is_there(package: str) -> bool:
+    """Tell whether a package can be found; it is not imported, but those around it."""
+    try:
+        return find_spec(package) is not None
+    except ModuleNotFoundError as error:  # one around it, or what that one imports
+        return not f"{package}.".startswith(f"{error.name}.")
+    except (Exception, SystemExit):  # told where it is imported
+        return True
 
 
 def _may_be_plugin(package: str) -> bool:

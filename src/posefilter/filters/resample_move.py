@@ -129,6 +129,8 @@ class ResampleMove:
         poses, log_target = take_poses(poses, order), log_target.gather(1, order)
         half = poses.shape[1] // 2
         for own, others in ((slice(half), slice(half, None)), (slice(half, None), slice(half))):
+            if not log_target[:, own].numel():  # the first half of one particle
+                continue
             proposed = self.propose(poses[:, own], poses[:, others], space, generator)
             new, old = score(proposed), log_target[:, own]
             chance = torch.rand(old.shape, generator=generator, device=old.device, dtype=old.dtype)

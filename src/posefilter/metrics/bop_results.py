@@ -32,13 +32,14 @@ class PoseRow(NamedTuple):
 
 def choose_score(probability: float | None, score: float) -> float:
     """Return the score of a line: the calibrated probability that the object is there and the pose
-    right; where there is none (None or NaN), the estimator's own score.
+    right; where there is none (None or NaN), the estimator's own score, and 0 where that is no
+    finite number.
 
     A file of calibrated methods alone, or of one method that is not, ranks across images and
     objects as BOP has it; scores of methods that are not calibrated compare in one image only.
     """
-    known = probability is not None and math.isfinite(probability)
-    return float(probability if known else score)  # type: ignore[arg-type]
+    numbers = (probability, score)
+    return next((float(x) for x in numbers if x is not None and math.isfinite(x)), 0.0)
 
 
 def to_native(camera_from_object: np.ndarray, native_from_mesh: np.ndarray) -> np.ndarray:

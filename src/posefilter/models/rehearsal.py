@@ -245,8 +245,11 @@ class _Watcher:
         _need(ancestors.dtype == torch.int64, who, told)
         inside = bool(((ancestors >= 0) & (ancestors < N)).all())
         _need(inside, who, f"ancestors are not all among the {N} particles")
-        if out.mixture_weights is not None:
-            _check_tensor(who, "mixture_weights", out.mixture_weights, (B, count, N))
+        mixture = out.mixture_weights
+        if mixture is not None:
+            _check_tensor(who, "mixture_weights", mixture, (B, count, N))
+            whole = bool((mixture.sum(2).log().abs() < _NORMAL).all() and (mixture >= 0).all())
+            _need(whole, who, "mixture_weights are no weights: a child's should sum to 1")
         return out
 
     def _propagate(self, who: str, call: Watch, state: Tensor, *_: Any) -> Any:

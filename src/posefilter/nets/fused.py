@@ -51,7 +51,7 @@ def applies(device: torch.device) -> bool:
 def missing_context() -> UserError:
     """Return the error of a likelihood with context whose points have none."""
     return UserError(
-        "model/likelihood=contextual reads the proposal network; choose model/proposals=dense or "
+        "model/likelihood: this one reads the proposal network; choose model/proposals=dense or "
         "model/likelihood=pointwise"
     )
 

@@ -80,7 +80,7 @@ class LatentNet(nn.Module):
     Args:
         extra: Number of context features.
         size: Side of the patch.
-        pose_width: Outputs of the pose head.
+        pose_width: Outputs of the pose head; 0 for none.
         latent_width: L.
         width: Width of hidden layers.
         layers: Linear layers of each MLP.
@@ -123,14 +123,16 @@ class LatentNet(nn.Module):
         self.latent_width = latent_width
         hidden = (width, layers, normalization, last_layer)
         self.latent = mlp(4 * size * size + extra + latent_width, latent_width, *hidden)
-        self.pose = mlp(latent_width, pose_width, *hidden)
+        # layers without outputs have no gradient
+        self.pose = mlp(latent_width, pose_width, *hidden) if pose_width else None
         self.likelihood = mlp(latent_width, 1, *hidden)
         self.displacement = mlp(pose_width + 1 + latent_width, 2, *hidden)
 
     def forward(self, patch: Tensor, extra: Tensor, latent: Tensor) -> NetOutput:
         """(B, N, C, k, k), (B, N, E), (B, N, L) -> NetOutput; C = 4, k = `size`, E = `extra`."""
         latent = self.latent(torch.cat([patch.flatten(2), extra, latent], dim=-1))
-        pose, logit = self.pose(latent), self.likelihood(latent)
+        pose = latent[..., :0] if self.pose is None else self.pose(latent)
+        logit = self.likelihood(latent)
         read = logit if self.displacement_input == "logit" else torch.sigmoid(logit)
         displacement = self.displacement(torch.cat([pose, read, latent], dim=-1))
         return NetOutput(latent, logit[..., 0], displacement, pose)
