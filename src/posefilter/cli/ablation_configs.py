@@ -12,13 +12,13 @@ from omegaconf import OmegaConf
 
 from posefilter.cli.ablations import (
     ABLATIONS,
-    BY_NAME,
     SIZE,
     Ablation,
     find_variant,
     list_detector_ablations,
     list_pose_ablations,
     list_pose_space_ablations,
+    list_steps,
 )
 from posefilter.cli.plain import to_plain
 
@@ -28,10 +28,8 @@ def resolve_overrides(ablation: Ablation) -> tuple[str, dict[str, str]]:
 
     A later override of the same group or key replaces an earlier one.
     """
-    chain = [ablation]
-    while not chain[0].parent.startswith("variant="):
-        chain.insert(0, BY_NAME[chain[0].parent])
-    pairs = [override.partition("=") for step in chain for override in step.overrides]
+    steps = list_steps(ablation)
+    pairs = [override.partition("=") for step in steps for override in step.overrides]
     return find_variant(ablation), {key: value for key, _, value in pairs}
 
 

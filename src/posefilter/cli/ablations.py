@@ -246,11 +246,17 @@ def list_models(name: str = "paper") -> list[str]:
     return [*with_pose, *detectors, *pose_space]
 
 
+def list_steps(ablation: Ablation) -> list[Ablation]:
+    """Return the rows that lead from a variant to a row, which is the last."""
+    steps = [ablation]
+    while not steps[0].parent.startswith("variant="):
+        steps.insert(0, BY_NAME[steps[0].parent])
+    return steps
+
+
 def find_variant(ablation: Ablation) -> str:
-    """Return the variant that a row, or the first of the rows that it builds on, changes."""
-    while not ablation.parent.startswith("variant="):
-        ablation = BY_NAME[ablation.parent]
-    return ablation.parent.partition("=")[2]
+    """Return the variant that the first of a row's steps changes."""
+    return list_steps(ablation)[0].parent.partition("=")[2]
 
 
 def list_pose_ablations() -> list[str]:

@@ -266,12 +266,12 @@ def places(job: Job) -> dict[str, Any]:
     named = {key: data.get(key) for key in ("root", "meshes", "cache_dir", "model_points_dir")}
     for group in ("options", "split"):  # lists of frames
         named |= {f"{group}.{key}": value for key, value in (data.get(group) or {}).items()}
-    told = {
+    outside = {
         f"data__{key}": value
         for key, value in named.items()
         if isinstance(value, str) and not stays_inside(value, Path())
     }
-    return told | ({"data__cache": "disk"} if data.get("cache") == "disk" else {})
+    return outside | ({"data__cache": "disk"} if data.get("cache") == "disk" else {})
 
 
 def plugins(job: Job) -> dict[str, Any]:

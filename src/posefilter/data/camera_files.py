@@ -97,7 +97,7 @@ def _of_camera(content: Mapping[str, Any], K: np.ndarray, path: Path) -> CameraF
 
 
 def _find_named(content: Mapping[str, Any], path: Path) -> tuple[float, ...]:
-    """Return the coefficients of a distortion that are told one by one, () where none is."""
+    """Return the coefficients of a distortion that are given one by one, () where none is."""
     inner = (content[key] for key in _DISTORTIONS if isinstance(content.get(key), Mapping))
     for one in (content, *inner):
         if "k1" in one:
@@ -108,12 +108,12 @@ def _find_named(content: Mapping[str, Any], path: Path) -> tuple[float, ...]:
 
 
 def _find_other_model(content: Mapping[str, Any]) -> str:
-    """Return the kind of distortion that a mapping tells, "" where it is OpenCV's polynomial, or
-    not told.
+    """Return the kind of distortion that a mapping names, "" where it is OpenCV's polynomial, or
+    names none.
     """
-    told = next((str(content[key]) for key in _MODELS if content.get(key) is not None), "")
-    plain = told.lower().removeprefix("distortion.").replace(" ", "_")  # as RealSense's tools do
-    return "" if plain in _POLYNOMIALS else told
+    named = next((str(content[key]) for key in _MODELS if content.get(key) is not None), "")
+    plain = named.lower().removeprefix("distortion.").replace(" ", "_")  # as RealSense's tools do
+    return "" if plain in _POLYNOMIALS else named
 
 
 def _find_matrix(content: Mapping[str, Any], path: Path) -> np.ndarray | None:

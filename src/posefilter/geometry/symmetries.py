@@ -58,8 +58,10 @@ def is_ball(symmetries: Tensor) -> bool:
     The mean square of the trace is then 1. It is 2 or more where one axis is left, and of the
     finite groups of which it is 1 the largest is the icosahedron's, of 60.
     """
+    if len(symmetries) <= 60:
+        return False
     traces = rotation_of(symmetries).diagonal(dim1=-2, dim2=-1).sum(-1)
-    return len(symmetries) > 60 and bool(traces.square().mean() < 1.5)
+    return bool(traces.square().mean() < 1.5)
 
 
 def list_equivalent(poses: Tensor, truth: Tensor, symmetries: Tensor) -> Tensor:

@@ -26,8 +26,8 @@ from posefilter.meshes.mesh import (
     surface_colors,
     surface_points,
 )
-from posefilter.meshes.rotational_symmetries import ANY, RotationalSymmetry, are_parallel
-from posefilter.meshes.symmetries import rotation_about
+from posefilter.meshes.rotational_symmetries import ANY, RotationalSymmetry
+from posefilter.meshes.symmetries import are_parallel, rotation_about
 
 FOLDS = (2, 3, 4)
 # Allowed beyond what two samplings of one surface differ by, in diameters: of the mean distance,

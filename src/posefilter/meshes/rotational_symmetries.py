@@ -7,10 +7,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from posefilter.meshes.symmetries import rotation_about, symmetry_group
+from posefilter.meshes.symmetries import are_parallel, rotation_about, symmetry_group
 
 ANY = 0  # the fold of a turn by any angle
-_PARALLEL = np.cos(np.deg2rad(10.0))
 _MOST_ELEMENTS = 60  # of a finite group of turns that is not of one axis
 _SMALLEST = np.deg2rad(25.0)  # turn in a group of turns by a quarter and more
 
@@ -105,11 +104,6 @@ def describe_symmetries(turns: Sequence[RotationalSymmetry], size: float) -> dic
             if turn.fold == ANY
         ],
     }
-
-
-def are_parallel(a: np.ndarray, b: np.ndarray) -> bool:
-    """Tell whether two unit vectors are parallel, within 10 degrees."""
-    return bool(abs(a @ b) > _PARALLEL)
 
 
 def _close(generators: Sequence[np.ndarray], size: float) -> list[np.ndarray]:

@@ -41,7 +41,7 @@ def symmetry_group(
         if not (np.isfinite(length) and length > 0):
             raise ValueError(f"an axis of length {length:g}")
         lines.append((np.asarray(axis, dtype=np.float64) / length, offset))
-    crossing = any(abs(a @ b) < _PARALLEL for (a, _), (b, _) in pairwise(lines))
+    crossing = any(not are_parallel(a, b) for (a, _), (b, _) in pairwise(lines))
     if (steps**2 if crossing else len(group) * steps ** len(lines)) > MOST:
         raise ValueError(f"more than {MOST:,} symmetries")
     if crossing:
@@ -52,6 +52,11 @@ def symmetry_group(
         about = [rotation_about(axis, 2 * np.pi * k / steps, offset) for k in range(steps)]
         group = [a @ b for a in group for b in about]
     return np.stack(group)
+
+
+def are_parallel(a: np.ndarray, b: np.ndarray) -> bool:
+    """Tell whether two unit vectors are parallel, within 10 degrees."""
+    return bool(abs(a @ b) > _PARALLEL)
 
 
 def _meet(lines: list[tuple[np.ndarray, np.ndarray]]) -> np.ndarray:
