@@ -1,5 +1,7 @@
 """What the author of a plug-in gets wrong is told in one line, and what he typed is told again."""
 
+import importlib
+import json
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -13,6 +15,7 @@ from posefilter.cli.checkpoints import build_method, method_of, recipe
 from posefilter.cli.command import compose_job
 from posefilter.cli.fit import check_fit
 from posefilter.cli.instantiate import instantiate
+from posefilter.cli.running import note_plugin
 from posefilter.cli.trust import Scope
 from posefilter.data.splits import split_records
 from posefilter.errors import UserError
@@ -199,6 +202,23 @@ def entry_point(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     monkeypatch.setattr(trust, "entry_points", lambda group: [Point()])
     yield
     trust.installed.cache_clear()
+
+
+def test_an_error_of_a_plug_ins_code_names_it(package: Path) -> None:
+    """Its traceback passes through the program, and may end in a library that it called."""
+    (package / "raising.py").write_text(
+        "import json\n\n\ndef loss():\n    return json.loads('{')\n"
+    )
+    with pytest.raises(ValueError, match="property name") as own:
+        importlib.import_module("ownpf.raising").loss()
+    sys.modules.pop("ownpf.raising")
+    note_plugin(own.value)
+    place = f"{package / 'raising.py'}, line 5, in loss"
+    assert own.value.__notes__ == [f"plugins=ownpf: the error is of this plug-in's code, {place}"]
+    with pytest.raises(ValueError, match="property name") as other:
+        json.loads("{")
+    note_plugin(other.value)
+    assert not hasattr(other.value, "__notes__")
 
 
 def test_a_trusted_package_brings_its_choices(

@@ -43,6 +43,11 @@ def test_a_mesh_in_another_unit_is_refused_with_the_unit_that_fits(
     assert np.allclose(np.ptp(drawn.vertices, axis=0), np.ptp(CARTON.vertices, axis=0) / 10)
 
 
+def test_a_unit_without_meshes_is_refused() -> None:
+    with pytest.raises(UserError, match=r"mesh_scale=0\.001: is the unit of meshes="):
+        open_shapes(OmegaConf.create({"meshes": None, "mesh_scale": 0.001}), ["carton"])
+
+
 def test_a_mesh_of_no_unit_is_of_another_object(tmp_path: Path) -> None:
     given = OmegaConf.create({"meshes": str(write(tmp_path, 0.4)), "mesh_scale": None})
     with pytest.raises(UserError, match="another object"):

@@ -93,6 +93,32 @@ def test_right_camera_stands_six_centimeters_to_the_right(tmp_path):
     ]
 
 
+@pytest.mark.parametrize(
+    ("part", "subsets"),
+    [
+        ("", ("single",)),
+        ("", ("mixed",)),
+        ("single", ("single", "mixed")),
+        ("mixed", ("mixed",)),
+        ("single/toy_16k", ("single", "mixed")),
+        ("single/toy_16k/kitchen_1", ("single", "mixed")),
+        ("mixed/kitchen_0", ("single", "mixed")),
+    ],
+)
+def test_scenes_keep_their_numbers_whichever_part_is_read(tmp_path, part, subsets):
+    """Else the estimates of one part would be matched with images of another."""
+    scenes = ("mixed/kitchen_0", "single/aid_16k/kitchen_0", "single/toy_16k/kitchen_0")
+    for scene_name in (*scenes, "single/toy_16k/kitchen_1"):
+        folder = fat_folder(tmp_path / scene_name, {"toy": 255})
+        fat_frame(folder, 7, [("toy", 255, pose())])
+    (tmp_path / "mixed" / "notes").mkdir()
+    numbers = {r.files[0]: r.scene_id for r in FatReader(tmp_path).records()}
+    assert sorted(numbers.values()) == [0, 2, 4, 6]
+    read = FatReader(tmp_path / part, subsets=subsets).records()
+    assert {r.files[0]: r.scene_id for r in read}.items() <= numbers.items()
+    assert 0 < len(read) < 4
+
+
 def test_four_decimals_of_a_quaternion_still_make_a_rotation(tmp_path):
     folder = one_frame(tmp_path)
     path = folder / "000007.left.json"

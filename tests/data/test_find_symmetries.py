@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import trimesh
 
 from posefilter.figures.symmetries import draw_symmetries
 from posefilter.meshes.builtin import catalog
@@ -66,6 +67,22 @@ def test_a_handle_and_a_foot_break_symmetry(name: str) -> None:
     turns = find_symmetries(catalog.build(name))
     expected = [ANY] if name == "bowl" else []
     assert folds(turns, texture=False) == folds(turns, texture=True) == expected
+
+
+@pytest.mark.parametrize(
+    ("sides", "ratio", "expected"), [(64, 1.0, [ANY]), (4, 0.9, [4]), (4, 1.0, [4])]
+)
+def test_the_axis_of_a_cone_as_wide_as_high_is_found(
+    sides: int, ratio: float, expected: list[int]
+) -> None:
+    """All its moments of inertia are alike."""
+    solid = trimesh.creation.cone(radius=0.05, height=0.1 * ratio, sections=sides)
+    turned = solid.apply_transform(rotation_about(np.array([0.6, 0.0, 0.8]), 1.1, np.zeros(3)))
+    gray = np.full((2, 2, 3), 128, np.uint8)
+    normals = np.repeat(turned.face_normals[:, None], 3, axis=1)
+    vertices, faces = np.array(turned.vertices), np.array(turned.faces)
+    mesh = Mesh("cone", vertices, faces, None, gray, None, normals)
+    assert folds(find_symmetries(mesh), texture=False) == expected
 
 
 def test_symmetries_move_with_the_object_and_survive_the_file(tmp_path: Path) -> None:

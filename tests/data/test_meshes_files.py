@@ -206,9 +206,13 @@ def _write_ply(path: Path, comments: str, properties: str, *values: str) -> Path
     return path
 
 
-@pytest.mark.parametrize("named", ["red", "diffuse_red"])
+@pytest.mark.parametrize("named", ["red", "diffuse_red", "r"])
 def test_ply_has_its_colors_where_coordinates_have_no_picture(tmp_path: Path, named: str) -> None:
-    colors = _COLORS if named == "red" else _COLORS.replace("uchar ", "uchar diffuse_")
+    colors = _COLORS
+    if named == "diffuse_red":
+        colors = colors.replace("uchar ", "uchar diffuse_")
+    elif named == "r":
+        colors = "".join(f"property uchar {name}\n" for name in "rgb")
     values = ["255 0 0 0 0", "0 255 0 1 0", "0 0 255 0 1"]
     path = _write_ply(tmp_path / "a.ply", "", colors + _MAPPED, *values)
     mesh = read_mesh(path, "a")

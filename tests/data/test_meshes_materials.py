@@ -169,6 +169,13 @@ def test_materials_of_other_exporters_are_read(material: str, tmp_path: Path) ->
         np.testing.assert_array_equal(mesh.texture, picture)
 
 
+@pytest.mark.parametrize("line", ['mtllib "my a.mtl"', "MTLLIB my a.mtl", "mtllib my a.mtl"])
+def test_a_material_file_may_be_quoted_and_its_keyword_large(line: str, tmp_path: Path) -> None:
+    (tmp_path / "my a.mtl").write_text("newmtl m\nKd 1 0 0\n")
+    (tmp_path / "a.obj").write_text(f"{line}\n{CORNERS.format('')}Usemtl m\nf 1/1 2/2 3/3\n")
+    assert read_mesh(tmp_path / "a.obj", "a").texture.tolist() == [[[255, 0, 0]]]
+
+
 @pytest.mark.parametrize(
     ("material", "message"),
     [

@@ -2,6 +2,8 @@
 shown.
 """
 
+import json
+
 import numpy as np
 import pytest
 import scipy.io
@@ -9,6 +11,7 @@ from dataset_trees import HEIGHT, WIDTH, K, pose, truth, write_png, ycb_frame
 
 from posefilter.data.frames import NotShown
 from posefilter.data.readers.ycb_video import YCBVideoReader
+from posefilter.data.splits import split_records
 from posefilter.errors import BadData, UserError
 from posefilter.meshes import ycb
 
@@ -81,6 +84,23 @@ def test_a_list_of_key_frames_chooses_and_counts_what_is_not_there(root):
     (root / "image_sets" / "other.txt").write_text("0077/000001\n")
     with pytest.raises(UserError, match="none of its 1 frames"):
         YCBVideoReader(root, NAME, frames="other.txt")
+
+
+@pytest.mark.parametrize("ending", ["txt", "json"])
+def test_scenes_of_a_list_that_are_not_there_are_named(root, caplog, ending):
+    """A scene that is there and does not show the object is no reason to warn."""
+    ycb_frame(root / "data" / "0051" / "000001", [(3, pose())], NATIVE)
+    frames = [(48, 2), (51, 1), (99, 1)]
+    lines = "".join(f"{scene:04d}/{frame:06d}\n" for scene, frame in frames)
+    targets = [{"scene_id": scene, "im_id": frame} for scene, frame in frames]
+    path = root / "image_sets" / f"part.{ending}"
+    path.write_text(lines if ending == "txt" else json.dumps(targets))
+    records = YCBVideoReader(root, NAME).records()
+    assert split_records(records, {"test": path.name}, 0, root)["test"] == [1]
+    (warning,) = caplog.messages
+    missing = "0099" if ending == "txt" else "99"
+    assert warning.startswith("data.split: 1 of the 3 scenes in ")
+    assert warning.endswith(f"are not in {root}, and are left out: {missing}")
 
 
 def test_a_list_may_name_a_frame_twice_and_rendered_frames(root):

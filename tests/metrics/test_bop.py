@@ -12,7 +12,7 @@ from posefilter.geometry.pose import make_pose, transform
 from posefilter.geometry.rotation import exp_so3, random_rotation
 from posefilter.geometry.symmetries import densify
 from posefilter.meshes.symmetries import rotation_about, symmetry_group
-from posefilter.metrics.bop import BopErrors, average_recall, mspd, mssd
+from posefilter.metrics.bop import BopErrors, average_recall, mspd, mspd_of_vertices, mssd
 from posefilter.types import ObjectModel
 
 K = intrinsics(500.0, 510.0, 320.0, 240.0).double()
@@ -53,6 +53,17 @@ def test_against_naive_loops() -> None:
                 apart = max(float((pixel(a) - pixel(b)).norm()) for a, b in pairs)
                 least = [min(least[0], far), min(least[1], apart)]
             assert [float(surface[i, j]), float(pixels[i, j])] == pytest.approx(least, rel=1e-9)
+
+
+def test_of_all_vertices_though_the_hull_hides_some() -> None:
+    """A vertex inside of the hull that is nearer to the camera may move by more pixels."""
+    poses, truth = scattered(8), scattered(8, seed=1)
+    few = POINTS[:5]
+    for pose, true in zip(poses, truth, strict=True):
+        expected = mspd(pose, true, HALF_TURNS, POINTS, K)
+        assert mspd_of_vertices(pose, true, HALF_TURNS, few, POINTS, K) == expected
+        assert mspd_of_vertices(pose, true, HALF_TURNS, POINTS, POINTS, K) == expected
+    assert any(mspd(poses, truth, HALF_TURNS, few, K) < mspd(poses, truth, HALF_TURNS, POINTS, K))
 
 
 def test_what_is_known_by_hand() -> None:

@@ -300,6 +300,24 @@ def test_a_jpeg_that_says_it_is_turned_is_read_as_it_is_stored() -> None:
     np.testing.assert_allclose(read, stored, atol=3)
 
 
+@pytest.mark.parametrize(
+    ("form", "swapped"),
+    [
+        ("rgb8; png compressed bgr8", False),
+        ("rgb8; png compressed rgb8", True),
+        ("bgr8; png compressed rgb8", True),
+        ("rgb8; png compressed ", False),
+        ("png", False),
+    ],
+)
+def test_red_and_blue_are_where_the_format_says(form: str, swapped: bool) -> None:
+    """The subscriber of `compressed` takes what is packed as `rgb8` for red first."""
+    red = np.zeros((4, 6, 3), np.uint8)
+    red[..., 0] = 250
+    packed = cv2.imencode(".png", red if swapped else red[..., ::-1])[1].tobytes()
+    np.testing.assert_array_equal(decode_color(make_compressed(form, packed), "/rgb"), red)
+
+
 def make_png(width: int, height: int) -> bytes:
     """Return a PNG of one color whose header names another size."""
     data = bytearray(cv2.imencode(".png", np.zeros((2, 2, 3), np.uint8))[1].tobytes())

@@ -15,7 +15,7 @@ from posefilter.data.readers.base import BaseReader
 from posefilter.errors import UserError
 from posefilter.geometry.symmetries import densify
 from posefilter.meshes.mesh import Mesh, hull_vertices
-from posefilter.metrics.bop import REFERENCE_WIDTH, mspd, mssd
+from posefilter.metrics.bop import REFERENCE_WIDTH, mspd_of_vertices, mssd
 from posefilter.metrics.bop_recall import TargetErrors, compute_average_recall
 from posefilter.metrics.bop_results import PoseRow, to_mesh
 from posefilter.metrics.bop_targets import Target
@@ -131,7 +131,9 @@ class _Judge:
         K = first.intrinsics.astype(np.float64)
         truths, poses = _stack_poses(samples, rows, self.data.reader)
         camera = torch.from_numpy(K)
-        pixels = _pair(partial(mspd, intrinsics=camera), poses, truths, symmetries, points)
+        vertices = torch.from_numpy(mesh.vertices).double()
+        measure = partial(mspd_of_vertices, vertices=vertices, intrinsics=camera)
+        pixels = _pair(measure, poses, truths, symmetries, points)
         true_depths = [self._render(mesh, pose, K, first) for pose in truths]
         surface = np.zeros((len(poses), len(truths), 10))
         for e, pose in enumerate(poses):

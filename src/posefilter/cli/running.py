@@ -28,7 +28,7 @@ from posefilter.cli.folders import (
 from posefilter.cli.job import Job, check_settings
 from posefilter.cli.preflight import check_files
 from posefilter.cli.replaced import replace_typed
-from posefilter.cli.trust import Scope, find_folders, installed, named, trust
+from posefilter.cli.trust import Scope, find_folders, installed, named, trust, trusted
 from posefilter.errors import Carrier, UserError
 from posefilter.locks import release
 from posefilter.paths import find_conf
@@ -80,12 +80,14 @@ def run_job(cfg: DictConfig, name: str, begun: list[Job], kept: list[Job]) -> An
             error = MemoryError(str(error))
         if job.swept and "summary" in HydraConfig.get().callbacks:  # the other jobs go on
             if not isinstance(error, EXPECTED):
+                note_plugin(error)
                 traceback.print_exception(error)
             print(f"{job.name} {' '.join(job.overrides)}: {first_line(error)}", file=sys.stderr)
             if not note_failure(job, first_line(error)):
                 kept.append(job)
             return None  # of NaN Optuna's sweeper would make an error
         if not isinstance(error, EXPECTED):
+            note_plugin(error)
             raise
         release(job.folder)
         with suppress(OSError):  # nothing of ours is in a folder that may not be written
@@ -95,6 +97,17 @@ def run_job(cfg: DictConfig, name: str, begun: list[Job], kept: list[Job]) -> An
         if job.swept:
             release(job.folder)
             finish_wandb()
+
+
+def note_plugin(error: Exception) -> None:
+    """Add to an error the plug-in whose code raised it, if any, for the end of its traceback."""
+    for frame, line in reversed([*traceback.walk_tb(error.__traceback__)]):
+        package = str(frame.f_globals.get("__name__")).partition(".")[0]
+        if package in trusted():
+            code = frame.f_code
+            place = f"{code.co_filename}, line {line}, in {code.co_name}"
+            error.add_note(f"plugins={package}: the error is of this plug-in's code, {place}")
+            return
 
 
 def finish_wandb() -> None:

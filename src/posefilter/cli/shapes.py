@@ -20,8 +20,15 @@ _UNITS = (1.0, 0.001, 0.01, 0.0254, 1000.0)  # [m]
 def open_shapes(cfg: DictConfig, objects: Sequence[str]) -> "MeshStore | None":
     """Return the meshes of `meshes=`, in the unit of `mesh_scale=` or the default of datasets; None
     where none are given.
+
+    Raises UserError where only their unit is.
     """
     if not cfg.meshes:
+        if cfg.mesh_scale is not None:
+            raise UserError(
+                f"mesh_scale={cfg.mesh_scale:g}: is the unit of meshes=, which is not given; the "
+                "checkpoint's own hull is in meters"
+            )
         return None
     # most are drawn by the hull that the checkpoint has, and need no readers of meshes
     from posefilter.data.readers.registry import default_mesh_scale

@@ -203,13 +203,31 @@ def _listed(records: Sequence[FrameRecord], file: str, root: Path) -> list[int]:
             for i, r in enumerate(records)
             if not targets.isdisjoint({(r.scene_id, r.im_id, r.obj_id), (r.scene_id, r.im_id)})
         ]
+        listed = {str(scene) for scene, *_ in targets}
+        seen = {str(records[i].scene_id) for i in chosen}
+        folders = (one.name for one in (*root.glob("*/"), *root.glob("*/*/")))
+        there = {str(int(name)) for name in folders if name.isdecimal()}
     else:
         lines = set(read_lines(path))
         chosen = [i for i, r in enumerate(records) if r.name in lines]
+        listed = {line.rpartition("/")[0] for line in lines}
+        seen = {records[i].name.rpartition("/")[0] for i in chosen}
+        homes = (root, *root.glob("*/"))
+        there = {one for one in listed if any((home / one).is_dir() for home in homes)}
     if not chosen:
         raise UserError(
             f"{path}: none of the frames that it lists is in {root} with the object asked for "
             "(data.object=null takes all objects)"
+        )
+    missing = sorted(listed - there - seen)
+    if missing and seen & there:  # elsewhere scenes are no folders, or are numbered otherwise
+        log.warning(
+            "data.split: %d of the %d scenes in %s are not in %s, and are left out: %s",
+            len(missing),
+            len(listed),
+            path,
+            root,
+            ", ".join(missing[:6]) + (", ..." if len(missing) > 6 else ""),
         )
     return chosen
 

@@ -1,6 +1,7 @@
 """Find an object's symmetries: turns that move its surface, and its texture, onto themselves.
 
-Candidate axes are the principal axes of the surface and the axes of its smallest oriented box.
+Candidate axes are the principal axes of the surface, the axes of its smallest oriented box, and two
+directions that every turn of it keeps: a cone about as wide as high has no other axis.
 About each, turns by a half, a third and a quarter are tried, and some by angles that divide no
 circle, which stand for any turn.  A turn is first refined by registering the turned surface with
 itself, since a scan's axes are not exact, and is then judged by distances of turned surface samples
@@ -37,6 +38,7 @@ MEAN_EXCESS, FAR_EXCESS = 0.01, 0.02
 MOST_COLOR = 0.18
 _SAMPLES, _DENSE = 3000, 20000
 _ANY_ANGLES = tuple(2 * np.pi * k * 0.381966 for k in (1, 2, 3))  # by the golden angle
+_LEAST_MOMENT = 0.01  # of the mean (cubed) distance; what samples of a symmetric shape stay below
 _COARSE = 0.03  # [diameters] a candidate that is farther off before its refinement is none
 
 
@@ -61,7 +63,7 @@ def find_symmetries(mesh: Mesh) -> list[RotationalSymmetry]:
     surface = _sample(mesh)
     center = surface.points.mean(0)  # every symmetry leaves the centroid as it is
     found: list[RotationalSymmetry] = []
-    for axis in _candidate_axes(mesh, surface.points - center):
+    for axis in _candidate_axes(mesh, surface):
         for fold in (ANY, *FOLDS):
             turn = _try(surface, axis, center, fold)
             if turn is not None and turn.shape:
@@ -91,11 +93,21 @@ def _sample(mesh: Mesh) -> _Surface:
     )
 
 
-def _candidate_axes(mesh: Mesh, centered: np.ndarray) -> list[np.ndarray]:
-    """Return the principal axes of the surface, and the axes of its smallest oriented box."""
-    principal = np.linalg.svd(centered, full_matrices=False)[2]
-    box = trimesh.bounds.oriented_bounds(hull_vertices(mesh.vertices))[0][:3, :3]
-    return [*principal, *box]
+def _candidate_axes(mesh: Mesh, surface: _Surface) -> list[np.ndarray]:
+    """Return the principal axes of the surface, the axes of its smallest oriented box, and the
+    directions of its third moment and of the middle of its convex hull, where they are not zero.
+    """
+    hull = hull_vertices(mesh.vertices)
+    principal = np.linalg.svd(surface.points - surface.points.mean(0), full_matrices=False)[2]
+    box = trimesh.bounds.oriented_bounds(hull)[0][:3, :3]
+    middle = surface.dense.mean(0)
+    centered = surface.dense - middle
+    away = np.linalg.norm(centered, axis=1, keepdims=True)
+    third = (away**2 * centered).mean(0) / (away**3).mean()
+    with np.errstate(divide="ignore", invalid="ignore"):  # of a flat mesh without a volume
+        to_hull = (trimesh.convex.convex_hull(hull).center_mass - middle) / away.mean()
+    sizes = ((one, float(np.linalg.norm(one))) for one in (third, to_hull))
+    return [*principal, *box, *(one / size for one, size in sizes if _LEAST_MOMENT < size < 1)]
 
 
 def _try(

@@ -108,6 +108,7 @@ def read_obj(path: Path) -> RawMesh:
     materials: dict[str | None, int] = {}
     current = 0
     for key, rest in _read_lines(path):
+        key = key.lower()
         if key in numbers:
             numbers[key].append([float(x) for x in rest.split()])
         elif key == "f":
@@ -118,6 +119,7 @@ def read_obj(path: Path) -> RawMesh:
                 corners += [polygon[0], polygon[i], polygon[i + 1]]
                 face_material.append(current)
         elif key == "mtllib":
+            rest = rest[1:-1] if len(rest) > 2 and rest[0] == rest[-1] == '"' else rest
             several = all((path.parent / file).is_file() for file in rest.split())
             for file in rest.split() if several else [rest]:
                 library |= _read_mtl(path.parent / file, path, images)
@@ -216,7 +218,7 @@ def _read_lines(path: Path) -> Iterator[tuple[str, str]]:
     text = text.replace("\r\n", "\n").replace("\\\n", " ")
     for line in text.splitlines():
         key, *rest = line.split(None, 1) or [""]
-        if key in ("v", "vt", "vn", "f"):
+        if key.lower() in ("v", "vt", "vn", "f"):
             rest = [part.partition("#")[0] for part in rest]
         yield key, "".join(rest).strip()
 

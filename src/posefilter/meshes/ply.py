@@ -13,6 +13,7 @@ _LONGEST = 1 << 20  # of a header [bytes]
 _TEXTURE = re.compile(r"comment\s+texturefile\s+(.+)", re.IGNORECASE)
 _PROPERTY = re.compile(r"^(\s*property\s+.*\s)(\w+)(\s*)$", re.MULTILINE)
 COLORS, _WIDE = {"red", "green", "blue"}, ("h", "H")
+_SHORT = {"r": "red", "g": "green", "b": "blue"}
 _COORDINATES = ("texture_u", "texture_v", "u", "v", "s", "t", "texcoord")
 
 
@@ -45,6 +46,8 @@ def open_ply(path: Path) -> tuple[io.BytesIO, list[str]]:
             "can have one here; convert it to .obj or .glb"
         )
     header = _PROPERTY.sub(lambda m: m[1] + m[2].removeprefix("diffuse_") + m[3], header)
+    if _SHORT.keys() <= {m[2] for m in _PROPERTY.finditer(header)}:
+        header = _PROPERTY.sub(lambda m: m[1] + _SHORT.get(m[2], m[2]) + m[3], header)
     elements = list(list_elements(header))
     properties = [one for element in elements for one in element.properties]
     names = {one.name for one in properties}

@@ -61,6 +61,43 @@ def mspd(
     )
 
 
+def mspd_of_vertices(
+    pose: Tensor,
+    truth: Tensor,
+    symmetries: Tensor,
+    hull: Tensor,
+    vertices: Tensor,
+    intrinsics: Tensor,
+) -> Tensor:
+    """Return the `mspd` over all vertices, which are looked at where the hull leaves it open: by
+    perspective, a nearer vertex inside of it may move by more pixels.
+
+    Args:
+        pose: (4, 4) estimate, camera_from_object [m].
+        truth: (4, 4) true pose.
+        symmetries: (S, 4, 4) object_from_object, the identity among them.
+        hull: (H, 3) some of the vertices [m], such as those of the convex hull.
+        vertices: (V, 3) of the object [m].
+        intrinsics: (3, 3) [px].
+
+    Returns:
+        () [px].
+    """
+
+    def greatest(same: Tensor, points: Tensor) -> Tensor:
+        guess = project(transform(pose, points), intrinsics)
+        return (project(transform(same, points), intrinsics) - guess).norm(dim=-1).amax(-1)
+
+    equivalent = list_equivalent(pose, truth.to(pose), symmetries)
+    at_least = greatest(equivalent, hull)
+    best = at_least.new_tensor(torch.inf)
+    for row in at_least.argsort().tolist():
+        if at_least[row] >= best:
+            break
+        best = torch.minimum(best, greatest(equivalent[row], vertices))
+    return best
+
+
 def _least_of_greatest(
     poses: Tensor,
     truth: Tensor,

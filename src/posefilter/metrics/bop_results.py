@@ -4,6 +4,7 @@ estimate (<https://bop.felk.cvut.cz/challenges>, "Formats").
 
 import csv
 import math
+import sys
 from collections.abc import Sequence
 from decimal import Decimal, InvalidOperation
 from pathlib import Path
@@ -16,6 +17,7 @@ from posefilter.files import open_whole_text
 from posefilter.limits import open_text
 
 _NEAREST = 0.02  # [m] median distance of objects
+_LEAST = -sys.float_info.max  # not all who read such files know infinity
 HEADER = ("scene_id", "im_id", "obj_id", "score", "R", "t", "time")
 
 
@@ -32,14 +34,14 @@ class PoseRow(NamedTuple):
 
 def choose_score(probability: float | None, score: float) -> float:
     """Return the score of a line: the calibrated probability that the object is there and the pose
-    right; where there is none (None or NaN), the estimator's own score, and 0 where that is no
-    finite number.
+    right; where there is none (None or NaN), the estimator's own score, and the least number where
+    that is not finite: a frame that showed nothing ranks last, also among log-likelihoods.
 
     A file of calibrated methods alone, or of one method that is not, ranks across images and
     objects as BOP has it; scores of methods that are not calibrated compare in one image only.
     """
     numbers = (probability, score)
-    return next((float(x) for x in numbers if x is not None and math.isfinite(x)), 0.0)
+    return next((float(x) for x in numbers if x is not None and math.isfinite(x)), _LEAST)
 
 
 def to_native(camera_from_object: np.ndarray, native_from_mesh: np.ndarray) -> np.ndarray:

@@ -97,6 +97,8 @@ def decode_color(message: Any, topic: str) -> np.ndarray:
 def _decode_compressed_color(message: Any, topic: str) -> np.ndarray:
     """Return color (H, W, 3) RGB of the transport `compressed`, whose format is such as `rgb8; jpeg
     compressed bgr8`: what it was, and what was packed; or the name of the packing alone.
+
+    Red and blue of `compressed rgb8`, which old publishers write, are packed the other way round.
     """
     own, _, packed = str(message.format).partition(";")
     own = own.strip()
@@ -106,7 +108,9 @@ def _decode_compressed_color(message: Any, topic: str) -> np.ndarray:
     if own in _BAYER and packed.split()[-1:] == ["compressed"]:  # the mosaic itself
         return np.asarray(cv2.cvtColor(decode_image(data, path, cv2.IMREAD_GRAYSCALE), _BAYER[own]))
     as_stored = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION  # as depth and camera_info are
-    return np.ascontiguousarray(decode_image(data, path, as_stored)[..., ::-1])
+    bgr = decode_image(data, path, as_stored)
+    swapped = packed.split()[-2:-1] == ["compressed"] and packed.split()[-1].startswith("rgb")
+    return bgr if swapped else np.ascontiguousarray(bgr[..., ::-1])
 
 
 def decode_depth(message: Any, topic: str, units: float = 1000.0) -> np.ndarray:

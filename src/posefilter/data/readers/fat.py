@@ -30,6 +30,7 @@ from posefilter.data.readers.fat_settings import (
     camera_from_aligned,
     camera_settings,
     mesh_name,
+    number_scenes,
     object_settings,
     scene_folders,
 )
@@ -107,7 +108,8 @@ class FatReader(BaseReader):
             objects, known, self.root, strip=lambda name: name.removesuffix("_16k")
         )
         self._entries: list[_Entry] = []
-        for number, (folder, one) in enumerate(settings):
+        numbers_of_scenes = number_scenes(self.root, folders)
+        for number, (folder, one) in zip(numbers_of_scenes, settings, strict=True):
             if one is not None:
                 self._entries += self._list_folder(number, folder, *one)
         if objects is None:

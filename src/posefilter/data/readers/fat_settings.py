@@ -2,7 +2,7 @@
 
 import math
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence, Set
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -20,6 +20,7 @@ from posefilter.paths import is_plain_name
 
 CM = 0.01  # meters a centimeter
 FRAME = re.compile(r"^(\d+\.(?:left|right))\.(?:json|jpg|png)$")
+SUBSETS = frozenset({"single", "mixed"})  # folders of the dataset
 _DEEPEST = 6  # folders between the dataset's and a scene's
 _NEWER = re.compile(r"\.(cs|is|depth\.16|depth\.cm\.\d+)\.png$")
 
@@ -42,14 +43,14 @@ class FatCamera:
     width: int
 
 
-def scene_folders(root: Path, subsets: set[str], deep: int = 0) -> Iterator[Path]:
+def scene_folders(root: Path, subsets: Set[str], deep: int = 0) -> Iterator[Path]:
     """Yield the folders that hold frames, not looking below them."""
     if not root.is_dir():
         raise UserError(f"{root}: no such folder (data.root)")
     if deep > _DEEPEST:
         raise UserError(f"{root}: folders nested more than {_DEEPEST} deep; a link to itself?")
     names = list_folder(root)
-    if "_object_settings.json" in names or any(map(FRAME.match, names)):
+    if _is_scene(names):
         yield root
         return
     if any(_NEWER.search(name) for name in names):
@@ -58,9 +59,34 @@ def scene_folders(root: Path, subsets: set[str], deep: int = 0) -> Iterator[Path
             f"has .seg.png, .depth.png"
         )
     for name in names:
-        unwanted = name.startswith(".") or name in {"single", "mixed"} - subsets
+        unwanted = name.startswith(".") or name in SUBSETS - subsets
         if not unwanted and (root / name).is_dir():
             yield from scene_folders(root / name, subsets, deep + 1)
+
+
+def number_scenes(root: Path, folders: Sequence[Path]) -> list[int]:
+    """Return the number of each folder of frames: its place among all scenes of its dataset, so
+    that it stays the same whichever part of the dataset is read.
+
+    Args:
+        root: The dataset's folder, or one in it: a subset, an object of `single`, a scene.
+        folders: Folders of frames in the root.
+    """
+    every = sorted(scene_folders(root, SUBSETS))
+    real = root.resolve()
+    above = next((one for one in (real, *real.parents[:2]) if one.name in SUBSETS), None)
+    if above is not None and SUBSETS.isdisjoint(list_folder(root)):
+        top = above.parent
+        layout = [*top.glob("mixed/*/"), *top.glob("single/*/*/")]
+        whole = sorted(one for one in layout if one.is_dir() and _is_scene(list_folder(one)))
+        if {real / one.relative_to(root) for one in every} <= set(whole):
+            return [whole.index(real / one.relative_to(root)) for one in folders]
+    return [every.index(one) for one in folders]
+
+
+def _is_scene(names: Sequence[str]) -> bool:
+    """Tell whether these are the names in a folder of frames."""
+    return "_object_settings.json" in names or any(map(FRAME.match, names))
 
 
 def mesh_name(fat_class: Any, path: Path) -> str:
