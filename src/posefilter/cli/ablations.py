@@ -235,11 +235,8 @@ _NOT_OF_DETECTORS = (
     "c3_bounded", "c4_balanced", "c5_displacement_loss",
 )  # fmt: skip
 BY_NAME = {ablation.name: ablation for ablation in ABLATIONS}
-_WITH_POSE, _DETECTORS, _POSE_SPACE = (
-    ("patch_pf", "pixel_pf"),
-    ("cnn_patch", "downsized"),
-    "pose_pf",
-)
+WITH_POSE, DETECTORS = ("patch_pf", "pixel_pf"), ("cnn_patch", "downsized")  # image-space methods
+_POSE_SPACE = "pose_pf"
 
 
 def list_models(name: str = "paper") -> list[str]:
@@ -247,8 +244,8 @@ def list_models(name: str = "paper") -> list[str]:
     if name.startswith(f"{_POSE_SPACE}_"):
         return [_POSE_SPACE]
     pose_space = [] if name not in ("paper", "working") else [_POSE_SPACE]
-    with_pose = [] if name.startswith("box_") else [*_WITH_POSE]
-    detectors = [] if name.startswith("pose_") else [*_DETECTORS]
+    with_pose = [] if name.startswith("box_") else [*WITH_POSE]
+    detectors = [] if name.startswith("pose_") else [*DETECTORS]
     return [*with_pose, *detectors, *pose_space]
 
 

@@ -1,9 +1,10 @@
 """Check a checkpoint, which others may have written: its archive, and its tensors."""
 
+import math
 import re
 import stat
 import zipfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,7 @@ from torch import Tensor, nn
 from torch.overrides import TorchFunctionMode
 
 from posefilter.cli.pickles import check_pickle
+from posefilter.cli.plain import walk
 from posefilter.errors import UserError
 from posefilter.geometry.pose import is_rigid
 from posefilter.paths import is_plain_name
@@ -88,7 +90,11 @@ def check_content(checkpoint: Any, file: Path) -> dict[str, Any]:
     ):
         raise UserError("not made by this project's train.py (no recipe or object in it)")
     size = file.stat().st_size
-    for value in _leaves(checkpoint):
+    for count, (_, depth, value) in enumerate(walk(checkpoint), 1):
+        if count > _MOST_NODES or depth > _DEEPEST:
+            raise UserError(
+                f"holds more than a checkpoint does ({_MOST_NODES} values, {_DEEPEST} deep)"
+            )
         if isinstance(value, Tensor):
             check_tensor(value, size)
     state = checkpoint["state_dict"]
@@ -170,24 +176,6 @@ def _check_object(model: Any) -> None:
             raise UserError(f"its object's {key} should be a length [m]")
 
 
-def _leaves(node: Any) -> Iterator[Any]:
-    """Yield every value, lazily and without recursion."""
-    stack, count = [(0, node)], 0
-    while stack:
-        depth, value = stack.pop()
-        count += 1
-        if count > _MOST_NODES or depth > _DEEPEST:
-            raise UserError(
-                f"holds more than a checkpoint does ({_MOST_NODES} values, {_DEEPEST} deep)"
-            )
-        if isinstance(value, dict):
-            stack += [(depth + 1, inner) for inner in value.values()]
-        elif isinstance(value, list | tuple | set):
-            stack += [(depth + 1, inner) for inner in value]
-        else:
-            yield value
-
-
 class Bounded(TorchFunctionMode):
     """While it is entered, tensors that are made anew stay within bounds: a recipe must not fill
     the memory.
@@ -205,10 +193,9 @@ class Bounded(TorchFunctionMode):
         """Count what a factory is to make, before it does."""
         kwargs = kwargs or {}
         if func in _FACTORIES:
-            count = 1
-            for size in _sizes((*args, kwargs.get("size"))):
-                count *= max(size, 1)
-            self.elements -= count
+            numbers = (value for _, _, value in walk((*args, kwargs.get("size"))))
+            sizes = [one for one in numbers if isinstance(one, int) and not isinstance(one, bool)]
+            self.elements -= math.prod(max(size, 1) for size in sizes)
             self.tensors -= 1
             if self.elements < 0 or self.tensors < 0:
                 raise UserError(
@@ -221,11 +208,3 @@ _FACTORIES = {
     *(torch.arange, torch.empty, torch.eye, torch.full, torch.linspace, torch.logspace),
     *(torch.ones, torch.rand, torch.randn, torch.zeros),
 }
-
-
-def _sizes(node: Any) -> Iterator[int]:
-    if isinstance(node, int) and not isinstance(node, bool):
-        yield node
-    elif isinstance(node, list | tuple):
-        for inner in node:
-            yield from _sizes(inner)

@@ -8,7 +8,7 @@ import yaml
 from hydra.core.override_parser.overrides_parser import OverridesParser
 
 from posefilter.cli.choices import SEVERAL
-from posefilter.cli.plain import key_of
+from posefilter.cli.plain import find, key_of
 from posefilter.errors import UserError
 
 MULTIRUN = ("-m", "--multirun")
@@ -156,8 +156,7 @@ def told_apart(arguments: Sequence[str], name: str, conf: Path) -> list[str]:
     if not is_multirun(arguments):
         return list(arguments)
     settings = yaml.safe_load((conf / f"{name}.yaml").read_text(encoding="utf-8"))
-    job = (settings.get("hydra") or {}).get("job") or {}
-    unnamed = ((job.get("config") or {}).get("override_dirname") or {}).get("exclude_keys") or []
+    unnamed = find(settings, "hydra.job.config.override_dirname.exclude_keys") or []
     typed = [a for a in arguments if key_of(a) in unnamed]
     swept = {
         own.key_or_group

@@ -46,13 +46,19 @@ def build_data(node: DictConfig, console: str, overrides: Sequence[str] = ()) ->
     if node.get("generate") and "_target_" not in node.generate:
         node = node.copy()
         node.generate = None  # sizes that debug=smoke has for scenes: this dataset renders none
-    data = instantiate(node, "data")
-    if not isinstance(data, PoseDataModule):
-        raise UserError(f"data._target_={node.get('_target_')}: is no data module")
+    data = make_data(node)
     data.prepare_data()
     if node.get("generate"):
         settings = {k: v for k, v in resolve(node.generate).items() if not k.startswith("_")}
         _check_rendered(data.root, settings, overrides)
+    return data
+
+
+def make_data(node: DictConfig) -> PoseDataModule:
+    """Build the data module; nothing is read or rendered yet."""
+    data = instantiate(node, "data")
+    if not isinstance(data, PoseDataModule):
+        raise UserError(f"data._target_={node.get('_target_')}: is no data module")
     return data
 
 

@@ -8,13 +8,13 @@ its numbers are such as methods have.
 
 import math
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from omegaconf import OmegaConf
 
-from posefilter.cli.plain import find, map_values, resolve
+from posefilter.cli.plain import find, map_values, resolve, walk
 from posefilter.cli.renamed import find_renamed, upgrade
 from posefilter.cli.trust import DATA_NAMES, is_plugin
 from posefilter.errors import UserError
@@ -71,7 +71,7 @@ def check_recipe(recipe: Any) -> dict[str, Any]:
     foreign = sorted(str(key) for key in settings if key in NOT_KEPT)
     if foreign:
         raise UserError(f"its recipe holds {foreign[0]}, which a checkpoint does not decide")
-    for count, (path, depth, value) in enumerate(_nodes(recipe)):
+    for count, (path, depth, value) in enumerate(walk(recipe)):
         if depth > _DEEPEST:
             raise UserError(f"its recipe is nested more than {_DEEPEST} deep")
         if count > _MOST_NODES:
@@ -109,7 +109,7 @@ def check_data(data: Mapping[str, Any], typed: Mapping[str, Any]) -> None:
         typed: The values that the user typed, by key, such as `root`.
     """
     own = set(map(str, typed.values()))
-    for path, _, value in _nodes(data):
+    for path, _, value in walk(data):
         key = path.lstrip(".")
         if (
             key.rpartition(".")[2] == "_target_"
@@ -140,21 +140,6 @@ def check_data(data: Mapping[str, Any], typed: Mapping[str, Any]) -> None:
 def _below_outputs(value: str) -> bool:
     parts = Path(value).parts
     return len(parts) > 1 and parts[0] == "outputs"
-
-
-def _nodes(node: Any) -> Iterator[tuple[str, int, Any]]:
-    """Yield (path, depth, value) of every node, lazily and without recursion."""
-    stack = [("", 0, node)]
-    while stack:
-        path, depth, value = stack.pop()
-        yield path, depth, value
-        if isinstance(value, Mapping):
-            stack += [
-                (f"{path}.{key}" if isinstance(key, str) else f"{path}.?", depth + 1, v)
-                for key, v in value.items()
-            ]
-        elif isinstance(value, list | tuple):
-            stack += [(f"{path}[{i}]", depth + 1, v) for i, v in enumerate(value)]
 
 
 def _check_value(path: str, value: Any) -> None:

@@ -4,7 +4,7 @@ the seed as one.
 
 import csv
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -14,7 +14,7 @@ from typing import NamedTuple
 from posefilter.errors import UserError
 from posefilter.forms import MOST
 from posefilter.limits import open_text
-from posefilter.metrics.scores import overall
+from posefilter.metrics.results import score_numbers
 from posefilter.report.diagnostics import list_numbers
 from posefilter.report.gather import SWEEP_MARKS, read_json, read_part, read_texts, read_yaml
 
@@ -191,19 +191,12 @@ def group_jobs(sweep: Sweep) -> list[Group]:
     return list(out.values())
 
 
-def score(numbers: Mapping[str, float]) -> float:
-    """Return what sweeps maximize (see `overall`)."""
-    least = float("-inf")
-    auc = numbers.get("add_up_to_symmetry/auc", numbers.get("add/auc"))
-    return overall(auc, numbers.get("particles_on_object", least), numbers.get("iou", least))
-
-
 def rank(jobs: Sequence[Job]) -> tuple[float, float]:
     """Return what the best of all has most of: the mean score to one decimal, then (where it ties)
     the least median ADD.
     """
     medians = [job.numbers.get("add/median_mm", math.inf) for job in jobs]
-    return round(mean(score(job.numbers) for job in jobs), 1), -mean(medians)
+    return round(mean(score_numbers(job.numbers, -math.inf) for job in jobs), 1), -mean(medians)
 
 
 def find_best_job(sweep: Sweep) -> Job:
