@@ -6,6 +6,7 @@ import re
 from collections.abc import Sequence
 from itertools import pairwise, product
 from pathlib import Path
+from typing import Any
 
 import yaml
 
@@ -67,7 +68,7 @@ def check_added(
     if not added:
         return
     folders = [conf, *choice_folders(typed)]
-    settings = yaml.safe_load((conf / f"{command}.yaml").read_text(encoding="utf-8"))
+    settings = read_settings(conf, command)
     chosen = {name for one in settings["defaults"] if isinstance(one, dict) for name in one}
     groups = {path.name for folder in folders for path in folder.glob("*") if path.is_dir()}
     files = (file for folder in folders for file in folder.glob("*/**/*.yaml"))
@@ -127,8 +128,8 @@ def check_ablations(arguments: Sequence[str], conf: Path) -> None:
     if "ablation" not in typed:
         return
     if "experiment" not in typed:  # which may set the method
-        settings = yaml.safe_load((conf / "train.yaml").read_text(encoding="utf-8"))
-        usual = next(one["model"] for one in settings["defaults"] if "model" in one)
+        defaults = read_settings(conf, "train")["defaults"]
+        usual = next(one["model"] for one in defaults if "model" in one)
         typed = {"model": usual, **typed}
     keys = ("ablation", "model", "variant")
     for name, model, variant in product(*(typed.get(key, "").split(",") for key in keys)):
@@ -182,6 +183,12 @@ def typed_plugins(arguments: Sequence[str]) -> list[str]:
     typed = [a.partition("=")[2] for a in arguments if re.match(r"\+{0,2}plugins=", a)]
     words = re.split(r"[\[\],\s'\"]+", typed[-1]) if typed else []
     return [word for word in words if re.fullmatch(r"[A-Za-z_][\w.]*", word) and word != "null"]
+
+
+def read_settings(conf: Path, command: str) -> dict[str, Any]:
+    """Return the settings of a command as they stand in its file, with its list of defaults."""
+    content: dict[str, Any] = yaml.safe_load((conf / f"{command}.yaml").read_text(encoding="utf-8"))
+    return content
 
 
 def list_choices(group: Path) -> list[str]:

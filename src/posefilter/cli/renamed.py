@@ -92,6 +92,7 @@ KEYS = {
         for old, new in (("start", "initial_sigma"), ("stop", "final_sigma"), ("points", "pixels"))
     },
 }
+_NAMES = GROUPS | KEYS
 # settings of single commands
 COMMANDS = {
     "calibrate": {"replace": "overwrite"},
@@ -356,10 +357,8 @@ def _rename_setting(key: str, command: str | None) -> str:
 
 
 def _rename_key(key: str) -> str:
-    if key in KEYS:
-        return KEYS[key]
-    if key in GROUPS:
-        return GROUPS[key]
+    if key in _NAMES:
+        return _NAMES[key]
     head, dot, rest = key.partition(".")
     if not dot:
         return key
@@ -385,7 +384,7 @@ def find_renamed(recipe: Mapping[str, Any]) -> tuple[str, str] | None:
         recipe: Its `choices` and `settings`.
     """
     old = [*recipe.get("choices", ()), *recipe.get("settings", ())]
-    return next(((n, _rename_key(n)) for n in map(str, old) if n in GROUPS or n in KEYS), None)
+    return next(((n, _rename_key(n)) for n in map(str, old) if n in _NAMES), None)
 
 
 def upgrade(recipe: Mapping[str, Any]) -> dict[str, Any]:

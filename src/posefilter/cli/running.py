@@ -117,13 +117,11 @@ def use_plugins(cfg: DictConfig) -> None:
         )
     for package in packages:
         trust(package)
-    for package in packages:
-        import_plugin(package)
-    import_installed()
+    import_trusted()
 
 
 def import_trusted() -> None:
-    """Import the plug-ins that the user of the library trusts, and installed ones."""
+    """Import the plug-ins that the user has named himself, and installed ones."""
     for package in sorted(named()):
         import_plugin(package)
     import_installed()

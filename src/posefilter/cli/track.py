@@ -35,12 +35,7 @@ from posefilter.meshes.ycb import number_objects
 from posefilter.metrics.bop_results import write_poses_csv
 from posefilter.progress import bars
 from posefilter.tracking.motion import ConstantVelocity
-from posefilter.tracking.records import (
-    compute_figures,
-    describe_row,
-    make_row,
-    write_rows,
-)
+from posefilter.tracking.records import compute_figures, describe_row, make_row, write_rows
 from posefilter.tracking.settings import FilterSettings, TrackerSettings
 from posefilter.tracking.track import TrackResult
 from posefilter.tracking.tracker import Tracker
