@@ -286,33 +286,27 @@ def _in_order(names: list[str]) -> list[str]:
     return [*(n for n in names[:first] if n != "working"), "working", *names[first:]]
 
 
-def resolve_overrides(ablation: Ablation) -> tuple[str, dict[str, str]]:
-    """Return the variant that a row changes, and its overrides with those of all its parents.
+def _make_node(groups: dict[str, str], **settings: Any) -> dict[str, Any]:
+    """Return choices and settings as Hydra composes them."""
+    defaults = [{f"override /{group}": choice} for group, choice in groups.items()]
+    return {"defaults": defaults, **settings}
 
-    A later override of the same group or key replaces an earlier one.
+
+def _make_row(ablation: Ablation) -> dict[str, Any]:
+    """Return a row with the overrides of all its parents: a later one of the same group or key
+    replaces an earlier one.
     """
-    steps = list_steps(ablation)
-    pairs = [override.partition("=") for step in steps for override in step.overrides]
-    return find_variant(ablation), {key: value for key, _, value in pairs}
-
-
-def make_node(ablation: Ablation) -> dict[str, Any]:
-    """Return a row as Hydra composes it: a list of defaults, and settings."""
-    variant, overrides = resolve_overrides(ablation)
-    groups = {"variant": variant} | {k: v for k, v in overrides.items() if "." not in k}
+    lists = (step.overrides for step in list_steps(ablation))
+    overrides = dict(override.split("=", 1) for own in lists for override in own)
+    groups = {"variant": find_variant(ablation)}
+    groups |= {k: v for k, v in overrides.items() if "." not in k}
     settings = OmegaConf.from_dotlist([f"{k}={v}" for k, v in overrides.items() if "." in k])
-    return {
-        "defaults": [{f"override /{group}": choice} for group, choice in groups.items()],
-        **to_plain(settings),
-    }
+    return _make_node(groups, **to_plain(settings))
 
 
 def _sweep(names: list[str], groups: dict[str, str], **settings: Any) -> dict[str, Any]:
-    return {
-        "defaults": [{f"override /{group}": choice} for group, choice in groups.items()],
-        **settings,
-        "hydra": {"mode": "MULTIRUN", "sweeper": {"params": {"ablation": ",".join(names)}}},
-    }
+    hydra = {"mode": "MULTIRUN", "sweeper": {"params": {"ablation": ",".join(names)}}}
+    return _make_node(groups, **settings, hydra=hydra)
 
 
 @cache
@@ -328,9 +322,8 @@ def register_ablations() -> None:
     """
     store = ConfigStore.instance()
     for ablation in ABLATIONS:
-        store.store(
-            group="ablation", name=ablation.name, node=make_node(ablation), package="_global_"
-        )
+        node = _make_row(ablation)
+        store.store(group="ablation", name=ablation.name, node=node, package="_global_")
     sweeps = {
         "ablation": _sweep(list_pose_ablations(), {SIZE: "${model}"}),
         "ablation_detect": _sweep(list_detector_ablations(), {}, filter={"particles": 32}),

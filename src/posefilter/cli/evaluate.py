@@ -1,6 +1,5 @@
 """Test a checkpoint, or poses of any other method, on a dataset."""
 
-import shutil
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import replace
@@ -19,7 +18,7 @@ from posefilter.cli.build import build_data, make_trainer, quiet
 from posefilter.cli.checkpoints import method_of, read_checkpoint
 from posefilter.cli.components import changed, changes, chosen
 from posefilter.cli.console import typed, warn
-from posefilter.cli.folders import holds_evaluation, read_results
+from posefilter.cli.folders import keep_training_results, read_results
 from posefilter.cli.job import Job
 from posefilter.cli.learned import DATA, list_learned
 from posefilter.cli.machine import settle
@@ -361,15 +360,3 @@ def object_to_judge(data: PoseDataModule, own: ObjectModel) -> ObjectModel:
         symmetries=theirs.symmetries,
         parts=theirs.parts,
     )
-
-
-def keep_training_results(folder: Path) -> None:
-    """Set what a run's own test has written aside, before an evaluation in its folder writes
-    others: `metrics_train.json`, `errors_train.csv`.
-    """
-    if not (folder / "metrics.json").is_file() or holds_evaluation(folder):
-        return
-    for name in ("metrics.json", ERRORS):
-        path = folder / name
-        if path.is_file():
-            shutil.copy2(path, path.with_stem(f"{path.stem}_train"))

@@ -319,7 +319,8 @@ def rename(override: str, command: str | None = None) -> str | None:
     sign, key, equals, value = _split(override)
     if key == "budget":
         return _BUDGET + value.partition("/")[0]
-    new = _rename_setting(key, command)
+    commands = (own for name, own in COMMANDS.items() if command in (None, name))
+    new = next((own[key] for own in commands if key in own), key)
     # a name of before that, too
     while (newer := _rename_key(new)) != new:
         new = newer
@@ -348,12 +349,6 @@ def _split(override: str) -> tuple[str, str, str, str]:
     found = re.fullmatch(r"([+~]*)([^=]*)(=?)(.*)", override, re.DOTALL)
     assert found is not None
     return found[1], found[2], found[3], found[4]
-
-
-def _rename_setting(key: str, command: str | None) -> str:
-    """Return what a setting is called today: of a command, or of all that have it."""
-    own = [one for name, one in COMMANDS.items() if command in (None, name) and key in one]
-    return own[0][key] if own else _rename_key(key)
 
 
 def _rename_key(key: str) -> str:
