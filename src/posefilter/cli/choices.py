@@ -3,7 +3,7 @@ Hydra stumbles over it; torch is not needed for it.
 """
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from itertools import pairwise, product
 from pathlib import Path
 from typing import Any
@@ -39,16 +39,13 @@ def check_choices(arguments: list[str], conf: Path, command: str | None = None) 
             raise UserError(f"{group}={value}: takes the name of a choice, not a value; {there}")
         if key == "preset" and value != "null":
             check_preset(value, [conf, *choice_folders(arguments)])
-        now = (
-            None
-            if own and (conf / group / f"{value}.yaml").is_file()
-            else rename(argument, command)
-        )
-        if now is not None:
+        is_there = own and (conf / group / f"{value}.yaml").is_file()
+        if not is_there and (now := rename(argument, command)):
             raise UserError(f"{argument}: is now {now}")
-    check_variants(arguments, conf)
-    if command == "train":
-        check_ablations(arguments, conf)
+    typed = dict(a.split("=", 1) for a in arguments if "=" in a)
+    check_variants(typed, conf)
+    if command == "train" and "ablation" in typed:
+        check_ablations(typed, conf)
     check_names([conf, *find_folders(named()), *config_folders(arguments)])
 
 
@@ -107,9 +104,8 @@ def check_several(group: str, value: str, folders: Sequence[Path]) -> None:
             )
 
 
-def check_variants(arguments: Sequence[str], conf: Path) -> None:
+def check_variants(typed: Mapping[str, str], conf: Path) -> None:
     """Raise UserError for a variant that a method lacks: Hydra would leave it without a preset."""
-    typed = dict(a.split("=", 1) for a in arguments if "=" in a)
     for model, variant in product(*(typed.get(k, "").split(",") for k in ("model", "variant"))):
         known = list_choices(conf / "preset" / model) if re.fullmatch(r"\w+", model) else []
         real = re.fullmatch(r"\w+", variant) and (conf / "variant" / f"{variant}.yaml").is_file()
@@ -120,13 +116,10 @@ def check_variants(arguments: Sequence[str], conf: Path) -> None:
             )
 
 
-def check_ablations(arguments: Sequence[str], conf: Path) -> None:
+def check_ablations(typed: Mapping[str, str], conf: Path) -> None:
     """Raise UserError for a step between variants that is another method's, or changes another
     variant than the one that is typed, which would win.
     """
-    typed = dict(a.split("=", 1) for a in arguments if "=" in a)
-    if "ablation" not in typed:
-        return
     if "experiment" not in typed:  # which may set the method
         defaults = read_settings(conf, "train")["defaults"]
         usual = next(one["model"] for one in defaults if "model" in one)
