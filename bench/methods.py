@@ -20,10 +20,9 @@ from typing import NamedTuple
 
 from programs import make_parser, run_command
 
-from posefilter.cli.ablations import list_pose_space_ablations
+from posefilter.cli.ablations import DETECTORS, WITH_POSE, list_pose_space_ablations
 
 FOUR = "model=downsized,cnn_patch,pixel_pf,patch_pf"
-WITH_POSE, DETECTORS = ("patch_pf", "pixel_pf"), ("cnn_patch", "downsized")
 MODELS = (*DETECTORS, *WITH_POSE)
 # but for the normalizations' statistics
 UNTRAINED = "optimizer.lr=0 trainer.max_steps=2 trainer.val_check_interval=2"

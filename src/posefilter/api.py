@@ -161,16 +161,12 @@ def build_data(config: DictConfig) -> "PoseDataModule":
     Raises:
         UserError: A setting does not fit; the message names it.
     """
-    from posefilter.cli.instantiate import instantiate
+    from posefilter.cli.build import make_data  # readers and meshes: `load` needs none
     from posefilter.cli.running import import_trusted
-    from posefilter.data.module import PoseDataModule  # readers and meshes: `load` needs none
 
     _check_config(config, "data")
     import_trusted()  # plug-ins register readers
-    data: Any = instantiate(config.data, "data")
-    if not isinstance(data, PoseDataModule):
-        raise UserError(f"data._target_={config.data.get('_target_')}: is no data module")
-    return data
+    return make_data(config.data)
 
 
 def _check_config(config: Any, section: str) -> None:

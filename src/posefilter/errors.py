@@ -1,7 +1,8 @@
 """What stands for a user's mistake, which a command tells in a line, and for a wish to stop."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from numbers import Integral
 from pathlib import Path
 from signal import Signals
@@ -20,6 +21,15 @@ def find_reason(error: BaseException) -> str:
     """Return the first line of an error's message, or its class where there is none."""
     lines = str(error).splitlines()
     return lines[0] if lines else type(error).__name__
+
+
+@contextmanager
+def naming(what: str) -> Iterator[None]:
+    """Have the messages of mistakes begin with what they are of, as it was typed."""
+    try:
+        yield
+    except UserError as error:
+        raise UserError(f"{what}: {error}") from error
 
 
 def check_choice(key: str, value: object, *choices: str) -> None:

@@ -55,9 +55,9 @@ def open_whole(path: Path, sync: bool = True) -> Iterator[BinaryIO]:
 
 
 @contextmanager
-def open_whole_text(path: Path, sync: bool = True) -> Iterator[TextIO]:
+def open_whole_text(path: Path) -> Iterator[TextIO]:
     """Open a text for writing, in UTF-8, its line ends as they are written; as `open_whole`."""
-    with open_whole(path, sync) as file:
+    with open_whole(path) as file:
         text = io.TextIOWrapper(file, encoding="utf-8", newline="")
         yield text
         text.flush()

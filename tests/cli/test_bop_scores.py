@@ -160,7 +160,7 @@ def test_an_estimate_an_image_is_not_compared_with_several_instances_without_a_w
     said: list[str] = []
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(
-            "posefilter.cli.evaluate.say", lambda console, event, text, **_: said.append(text)
+            "posefilter.cli.console.say", lambda console, event, text, **_: said.append(text)
         )
         warn_of_several(data, "json")
     (line,) = said

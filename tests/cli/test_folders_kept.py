@@ -7,8 +7,7 @@ import pytest
 from omegaconf import OmegaConf
 
 from posefilter.cli import run_command
-from posefilter.cli.evaluate import keep_training_results
-from posefilter.cli.folders import KeepResults, move_evaluation, own_metrics
+from posefilter.cli.folders import KeepResults, keep_training_results, move_evaluation, own_metrics
 from posefilter.cli.predict import remove_answers
 from posefilter.errors import UserError
 

@@ -16,7 +16,7 @@ from posefilter.cli.job import Job as Run
 from posefilter.cli.sweeps import SweepSummary, list_rows, summarize
 from posefilter.errors import Carrier
 from posefilter.metrics.registry import PERCENT
-from posefilter.report.summary import draw_summary
+from posefilter.report.sweep_charts import draw_summary
 from posefilter.report.sweeps import Job, Sweep, read_sweep
 
 HOME = Path(__file__).parents[2]

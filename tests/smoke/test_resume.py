@@ -301,16 +301,16 @@ def test_a_job_of_a_chosen_sweep_is_resumed_by_itself(tmp_path: Path) -> None:
     ]
 
 
-def test_what_a_record_may_not_bring_is_named_as_it_is_to_be_typed(tmp_path: Path) -> None:
+def test_what_a_record_may_not_bring_is_named_as_it_is_to_be_typed() -> None:
     brought = ["model=patch_pf", "data.root=data/mine", "callbacks=checkpoints", "out=/elsewhere"]
     refused = ["logger=wandb", "logger=[csv,wandb]", "data.root=/mine/two words"]
-    assert list_unkept(brought, tmp_path) == []
-    assert list_unkept([*brought, *refused], tmp_path) == [
+    assert list_unkept(brought) == []
+    assert list_unkept([*brought, *refused]) == [
         *("logger=wandb", "'logger=[csv,wandb]'", "'data.root=/mine/two words'"),
     ]
     for one in refused:
         with pytest.raises(UserError, match=f"its {one.partition('=')[0]}="):
-            check_override(one, tmp_path)
+            check_override(one)
 
 
 @pytest.mark.slow

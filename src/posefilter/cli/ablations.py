@@ -6,7 +6,13 @@ for the working method without one of them; `pose_` and `box_` before it are for
 with a pose and for detectors, `pose_pf_` for the pose-space method.
 """
 
-from typing import NamedTuple
+from functools import cache
+from typing import Any, NamedTuple
+
+from hydra.core.config_store import ConfigStore
+from omegaconf import OmegaConf
+
+from posefilter.cli.plain import to_plain
 
 SIZE = "preset/size"  # the group of a working preset's numbers
 
@@ -229,11 +235,8 @@ _NOT_OF_DETECTORS = (
     "c3_bounded", "c4_balanced", "c5_displacement_loss",
 )  # fmt: skip
 BY_NAME = {ablation.name: ablation for ablation in ABLATIONS}
-_WITH_POSE, _DETECTORS, _POSE_SPACE = (
-    ("patch_pf", "pixel_pf"),
-    ("cnn_patch", "downsized"),
-    "pose_pf",
-)
+WITH_POSE, DETECTORS = ("patch_pf", "pixel_pf"), ("cnn_patch", "downsized")  # image-space methods
+_POSE_SPACE = "pose_pf"
 
 
 def list_models(name: str = "paper") -> list[str]:
@@ -241,8 +244,8 @@ def list_models(name: str = "paper") -> list[str]:
     if name.startswith(f"{_POSE_SPACE}_"):
         return [_POSE_SPACE]
     pose_space = [] if name not in ("paper", "working") else [_POSE_SPACE]
-    with_pose = [] if name.startswith("box_") else [*_WITH_POSE]
-    detectors = [] if name.startswith("pose_") else [*_DETECTORS]
+    with_pose = [] if name.startswith("box_") else [*WITH_POSE]
+    detectors = [] if name.startswith("pose_") else [*DETECTORS]
     return [*with_pose, *detectors, *pose_space]
 
 
@@ -281,3 +284,50 @@ def _in_order(names: list[str]) -> list[str]:
     """Move `working` between what is added to the paper and what is taken from working."""
     first = next(i for i, name in enumerate(names) if name.startswith("m"))
     return [*(n for n in names[:first] if n != "working"), "working", *names[first:]]
+
+
+def _make_node(groups: dict[str, str], **settings: Any) -> dict[str, Any]:
+    """Return choices and settings as Hydra composes them."""
+    defaults = [{f"override /{group}": choice} for group, choice in groups.items()]
+    return {"defaults": defaults, **settings}
+
+
+def _make_row(ablation: Ablation) -> dict[str, Any]:
+    """Return a row with the overrides of all its parents: a later one of the same group or key
+    replaces an earlier one.
+    """
+    lists = (step.overrides for step in list_steps(ablation))
+    overrides = dict(override.split("=", 1) for own in lists for override in own)
+    groups = {"variant": find_variant(ablation)}
+    groups |= {k: v for k, v in overrides.items() if "." not in k}
+    settings = OmegaConf.from_dotlist([f"{k}={v}" for k, v in overrides.items() if "." in k])
+    return _make_node(groups, **to_plain(settings))
+
+
+def _sweep(names: list[str], groups: dict[str, str], **settings: Any) -> dict[str, Any]:
+    hydra = {"mode": "MULTIRUN", "sweeper": {"params": {"ablation": ",".join(names)}}}
+    return _make_node(groups, **settings, hydra=hydra)
+
+
+@cache
+def register_ablations() -> None:
+    """Register the table with Hydra: rows are chosen like files of `conf/ablation/`,
+    `ablation=NAME`, or all for a kind of method in one sweep, by `sweep=ablation`,
+    `sweep=ablation_detect` and `sweep=ablation_pose`.
+
+    All runs of `sweep=ablation` have the size of the working preset, so that a row differs from the
+    next in its modification alone. All runs of `sweep=ablation_detect` have 32 particles, for time;
+    those that start from the paper keep its 30 steps, since shorter roll-outs are a modification.
+    All runs of `sweep=ablation_pose`, for pose_pf, are of `experiment=small_scenes`.
+    """
+    store = ConfigStore.instance()
+    for ablation in ABLATIONS:
+        node = _make_row(ablation)
+        store.store(group="ablation", name=ablation.name, node=node, package="_global_")
+    sweeps = {
+        "ablation": _sweep(list_pose_ablations(), {SIZE: "${model}"}),
+        "ablation_detect": _sweep(list_detector_ablations(), {}, filter={"particles": 32}),
+        "ablation_pose": _sweep(list_pose_space_ablations(), {"experiment": "small_scenes"}),
+    }
+    for name, node in sweeps.items():
+        store.store(group="sweep", name=name, node=node, package="_global_")

@@ -1,9 +1,10 @@
 """Check a checkpoint, which others may have written: its archive, and its tensors."""
 
+import math
 import re
 import stat
 import zipfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,7 @@ from torch import Tensor, nn
 from torch.overrides import TorchFunctionMode
 
 from posefilter.cli.pickles import check_pickle
+from posefilter.cli.plain import walk
 from posefilter.errors import UserError
 from posefilter.geometry.pose import is_rigid
 from posefilter.paths import is_plain_name
@@ -28,63 +30,57 @@ _FARTHEST = 1000.0  # length of an object [m]
 _SPREAD = 4  # times the bytes of a file that its weights may stand for
 
 
-def check_archive(file: Path, said: str) -> None:
+def check_archive(file: Path) -> None:
     """Raise UserError unless a file is an archive as torch.save writes it: parts stored as they
     are, no larger than it.
 
     Args:
         file: The file.
-        said: How the user named it, for messages.
     """
     size = file.stat().st_size
     if size > _LARGEST:
-        raise UserError(f"{said}: {size / 1e9:.0f} GB is more than a checkpoint has")
+        raise UserError(f"{size / 1e9:.0f} GB is more than a checkpoint has")
     try:
         archive = zipfile.ZipFile(file)
     except (zipfile.BadZipFile, OSError, ValueError, NotImplementedError) as error:
-        raise UserError(
-            f"{said}: not readable as a checkpoint (no archive as torch writes it)"
-        ) from error
+        raise UserError("not readable as a checkpoint (no archive as torch writes it)") from error
     with archive:
         parts = archive.infolist()
-        _check_parts(parts, size, said)
+        _check_parts(parts, size)
         try:  # torch looks at no checksum, and would load weights that are other numbers
             broken = archive.testzip()
         except (zipfile.BadZipFile, OSError, ValueError, RuntimeError, EOFError) as error:
-            raise UserError(f"{said}: not readable as a checkpoint (it is damaged)") from error
+            raise UserError("not readable as a checkpoint (it is damaged)") from error
         if broken is not None:
             raise UserError(
-                f"{said}: is damaged: its part {broken[:60]!r} is not what was written; copy it "
-                "again"
+                f"is damaged: its part {broken[:60]!r} is not what was written; copy it again"
             )
         for part in parts:
             if part.filename.lower().endswith(".pkl"):
-                check_pickle(archive.read(part), said)
+                check_pickle(archive.read(part))
 
 
-def _check_parts(parts: Sequence[zipfile.ZipInfo], size: int, said: str) -> None:
+def _check_parts(parts: Sequence[zipfile.ZipInfo], size: int) -> None:
     if len(parts) > _MOST_FILES:
-        raise UserError(f"{said}: {len(parts)} parts are more than a checkpoint has")
+        raise UserError(f"{len(parts)} parts are more than a checkpoint has")
     for part in parts:
         if part.compress_type != zipfile.ZIP_STORED or part.file_size != part.compress_size:
             raise UserError(
-                f"{said}: its part {part.filename[:60]!r} is compressed, which torch does not do"
+                f"its part {part.filename[:60]!r} is compressed, which torch does not do"
             )
         if (
             not _PART.fullmatch(part.filename)
             or ".." in part.filename.split("/")
             or stat.S_ISLNK(part.external_attr >> 16)
         ):
-            raise UserError(
-                f"{said}: its part {part.filename[:60]!r} is not named as torch names them"
-            )
+            raise UserError(f"its part {part.filename[:60]!r} is not named as torch names them")
     if sum(part.file_size for part in parts) > size:
-        raise UserError(f"{said}: its parts claim to be larger than the file")
+        raise UserError("its parts claim to be larger than the file")
     if len({part.filename.lower() for part in parts}) < len(parts):  # torch's reader sees no case
-        raise UserError(f"{said}: two of its parts have one name")
+        raise UserError("two of its parts have one name")
 
 
-def check_content(checkpoint: Any, file: Path, said: str) -> dict[str, Any]:
+def check_content(checkpoint: Any, file: Path) -> dict[str, Any]:
     """Return what a checkpoint holds.
 
     Raises UserError where it is none of ours, or a tensor is not what it seems.
@@ -92,23 +88,27 @@ def check_content(checkpoint: Any, file: Path, said: str) -> dict[str, Any]:
     if not isinstance(checkpoint, dict) or not {"state_dict", "recipe", "object_model"} <= set(
         checkpoint
     ):
-        raise UserError(f"{said}: not made by this project's train.py (no recipe or object in it)")
+        raise UserError("not made by this project's train.py (no recipe or object in it)")
     size = file.stat().st_size
-    for value in _leaves(checkpoint, said):
+    for count, (_, depth, value) in enumerate(walk(checkpoint), 1):
+        if count > _MOST_NODES or depth > _DEEPEST:
+            raise UserError(
+                f"holds more than a checkpoint does ({_MOST_NODES} values, {_DEEPEST} deep)"
+            )
         if isinstance(value, Tensor):
-            check_tensor(value, size, said)
+            check_tensor(value, size)
     state = checkpoint["state_dict"]
     if not isinstance(state, dict) or not all(
         isinstance(k, str) and isinstance(v, Tensor) for k, v in state.items()
     ):
-        raise UserError(f"{said}: its state_dict should hold tensors by name")
+        raise UserError("its state_dict should hold tensors by name")
     if sum(value.numel() * value.element_size() for value in state.values()) > _SPREAD * size:
-        raise UserError(f"{said}: its weights claim to be larger than the file")
-    _check_object(checkpoint["object_model"], said)
+        raise UserError("its weights claim to be larger than the file")
+    _check_object(checkpoint["object_model"])
     return checkpoint
 
 
-def check_tensor(value: Tensor, size: int, said: str) -> None:
+def check_tensor(value: Tensor, size: int) -> None:
     """Raise UserError unless a tensor is plain, and all of it in a file of this size [bytes]."""
     shape = list(value.shape)
     plain = (
@@ -118,17 +118,13 @@ def check_tensor(value: Tensor, size: int, said: str) -> None:
         and not value.is_complex()
     )
     if not plain or value.is_quantized:
-        raise UserError(
-            f"{said}: holds a tensor of an unusual kind ({value.layout}, {value.device.type})"
-        )
+        raise UserError(f"holds a tensor of an unusual kind ({value.layout}, {value.device.type})")
     held = value.untyped_storage().nbytes()
     if value.numel() * value.element_size() > held or held > size:
-        raise UserError(
-            f"{said}: a tensor of shape {shape[:8]} claims more elements than the file holds"
-        )
+        raise UserError(f"a tensor of shape {shape[:8]} claims more elements than the file holds")
 
 
-def _check_object(model: Any, said: str) -> None:
+def _check_object(model: Any) -> None:
     shapes = {"points": (-1, 3), "center": (3,), "symmetries": (-1, 4, 4), "hull": (-1, 3)}
     # checkpoints of earlier versions have none of these
     packed = isinstance(model, dict) and model.get("texture_look") is not None
@@ -136,19 +132,18 @@ def _check_object(model: Any, said: str) -> None:
     needed = {"name", "radius", "diameter", *shapes}
     if not isinstance(model, dict) or set(model) - {"parts", "texture_look", *later} != needed:
         raise UserError(
-            f"{said}: its object should have name, points, center, radius, diameter, "
-            f"symmetries and hull"
+            "its object should have name, points, center, radius, diameter, symmetries and hull"
         )
     name = model["name"]
     if not (isinstance(name, str) and is_plain_name(name)):
-        raise UserError(f"{said}: its object's name {str(name)[:40]!r} is not a plain one")
+        raise UserError(f"its object's name {str(name)[:40]!r} is not a plain one")
     parts = {} if model.get("parts") is None else model["parts"]
     if not (
         isinstance(parts, dict)
         and len(parts) <= _PARTS
         and all(isinstance(part, str) and is_plain_name(part) for part in parts)
     ):
-        raise UserError(f"{said}: its object's parts should be points by plain names")
+        raise UserError("its object's parts should be points by plain names")
     held = {key: model[key] for key in shapes}
     held |= {key: model[key] for key in later if model.get(key) is not None}
     named = {key: (value, (shapes | later)[key]) for key, value in held.items()}
@@ -158,47 +153,27 @@ def _check_object(model: Any, said: str) -> None:
         if not fits or any(
             want not in (-1, have) for want, have in zip(shape, value.shape, strict=True)
         ):
-            raise UserError(f"{said}: its object's {key} should be numbers of shape {shape}")
+            raise UserError(f"its object's {key} should be numbers of shape {shape}")
         most = _MOST.get(key, _POINTS)
         if not 0 < len(value) <= most or not bool((value.abs() < _FARTHEST).all()):
             raise UserError(
-                f"{said}: its object's {key} should have 1 to {most} rows of finite lengths [m]"
+                f"its object's {key} should have 1 to {most} rows of finite lengths [m]"
             )
     for key in held:
         if key.endswith("symmetries") and not is_rigid(held[key].double()):
-            raise UserError(f"{said}: its object's {key} should be turns, each with a shift")
+            raise UserError(f"its object's {key} should be turns, each with a shift")
     if packed:
         look, count = model["texture_look"], len(held["texture"]) if "texture" in held else -1
         fits = isinstance(look, Tensor) and look.dtype == torch.uint8
         if not (fits and look.shape == (count, 6)):
-            raise UserError(
-                f"{said}: its object's texture_look should be 6 bytes for each of its points"
-            )
+            raise UserError("its object's texture_look should be 6 bytes for each of its points")
     elif "texture" in held:
         colors = held["texture"][:, 6:]
         if not bool(((colors >= 0) & (colors <= 1)).all()):
-            raise UserError(f"{said}: its object's texture should have colors in [0, 1]")
+            raise UserError("its object's texture should have colors in [0, 1]")
     for key in ("radius", "diameter"):
         if not (isinstance(model[key], float | int) and 0 < model[key] < 1000):
-            raise UserError(f"{said}: its object's {key} should be a length [m]")
-
-
-def _leaves(node: Any, said: str) -> Iterator[Any]:
-    """Yield every value, lazily and without recursion."""
-    stack, count = [(0, node)], 0
-    while stack:
-        depth, value = stack.pop()
-        count += 1
-        if count > _MOST_NODES or depth > _DEEPEST:
-            raise UserError(
-                f"{said}: holds more than a checkpoint does ({_MOST_NODES} values, {_DEEPEST} deep)"
-            )
-        if isinstance(value, dict):
-            stack += [(depth + 1, inner) for inner in value.values()]
-        elif isinstance(value, list | tuple | set):
-            stack += [(depth + 1, inner) for inner in value]
-        else:
-            yield value
+            raise UserError(f"its object's {key} should be a length [m]")
 
 
 class Bounded(TorchFunctionMode):
@@ -208,25 +183,23 @@ class Bounded(TorchFunctionMode):
     Args:
         elements: How many there may be, all tensors together.
         tensors: How many tensors.
-        said: How the user named the checkpoint, for messages.
     """
 
-    def __init__(self, elements: int, tensors: int, said: str) -> None:
+    def __init__(self, elements: int, tensors: int) -> None:
         super().__init__()
-        self.elements, self.tensors, self.said = elements, tensors, said
+        self.elements, self.tensors = elements, tensors
 
     def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         """Count what a factory is to make, before it does."""
         kwargs = kwargs or {}
         if func in _FACTORIES:
-            count = 1
-            for size in _sizes((*args, kwargs.get("size"))):
-                count *= max(size, 1)
-            self.elements -= count
+            numbers = (value for _, _, value in walk((*args, kwargs.get("size"))))
+            sizes = [one for one in numbers if isinstance(one, int) and not isinstance(one, bool)]
+            self.elements -= math.prod(max(size, 1) for size in sizes)
             self.tensors -= 1
             if self.elements < 0 or self.tensors < 0:
                 raise UserError(
-                    f"{self.said}: its recipe describes a method larger than the weights it brings"
+                    "checkpoint: its recipe describes a method larger than the weights it brings"
                 )
         return func(*args, **kwargs)
 
@@ -235,11 +208,3 @@ _FACTORIES = {
     *(torch.arange, torch.empty, torch.eye, torch.full, torch.linspace, torch.logspace),
     *(torch.ones, torch.rand, torch.randn, torch.zeros),
 }
-
-
-def _sizes(node: Any) -> Iterator[int]:
-    if isinstance(node, int) and not isinstance(node, bool):
-        yield node
-    elif isinstance(node, list | tuple):
-        for inner in node:
-            yield from _sizes(inner)

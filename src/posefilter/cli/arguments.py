@@ -4,11 +4,10 @@ import re
 from collections.abc import Sequence
 from pathlib import Path
 
-import yaml
 from hydra.core.override_parser.overrides_parser import OverridesParser
 
-from posefilter.cli.choices import SEVERAL
-from posefilter.cli.plain import key_of
+from posefilter.cli.choices import SEVERAL, read_settings
+from posefilter.cli.plain import find, key_of
 from posefilter.errors import UserError
 
 MULTIRUN = ("-m", "--multirun")
@@ -31,6 +30,7 @@ _LISTED = re.compile(  # a glimpse's size is one number
 )
 _NUMBER = re.compile(r"[+-]?[0-9_.]*[0-9][0-9_.]*([eE][+-]?[0-9_]+)?")
 _FOLDERS = ("run", "runs", "sweep", "out")  # of a report
+TYPED = {"sweep_folder": "sweep"}  # settings whose name is another than what is typed
 
 
 def options_first(arguments: Sequence[str]) -> list[str]:
@@ -155,9 +155,9 @@ def told_apart(arguments: Sequence[str], name: str, conf: Path) -> list[str]:
     """
     if not is_multirun(arguments):
         return list(arguments)
-    settings = yaml.safe_load((conf / f"{name}.yaml").read_text(encoding="utf-8"))
-    job = (settings.get("hydra") or {}).get("job") or {}
-    unnamed = ((job.get("config") or {}).get("override_dirname") or {}).get("exclude_keys") or []
+    unnamed = (
+        find(read_settings(conf, name), "hydra.job.config.override_dirname.exclude_keys") or []
+    )
     typed = [a for a in arguments if key_of(a) in unnamed]
     swept = {
         own.key_or_group

@@ -46,13 +46,19 @@ def build_data(node: DictConfig, console: str, overrides: Sequence[str] = ()) ->
     if node.get("generate") and "_target_" not in node.generate:
         node = node.copy()
         node.generate = None  # sizes that debug=smoke has for scenes: this dataset renders none
-    data = instantiate(node, "data")
-    if not isinstance(data, PoseDataModule):
-        raise UserError(f"data._target_={node.get('_target_')}: is no data module")
+    data = make_data(node)
     data.prepare_data()
     if node.get("generate"):
         settings = {k: v for k, v in resolve(node.generate).items() if not k.startswith("_")}
         _check_rendered(data.root, settings, overrides)
+    return data
+
+
+def make_data(node: DictConfig) -> PoseDataModule:
+    """Build the data module; nothing is read or rendered yet."""
+    data = instantiate(node, "data")
+    if not isinstance(data, PoseDataModule):
+        raise UserError(f"data._target_={node.get('_target_')}: is no data module")
     return data
 
 
@@ -89,34 +95,12 @@ def build_trainer(job: Job) -> Trainer:
     quiet()
     cfg = job.cfg.copy()
     cfg.folder = str(job.folder)
+    _check_trainer(cfg.trainer)
     steps, interval = cfg.trainer.get("max_steps", -1), cfg.trainer.get("val_check_interval")
-    if steps is None:
-        raise UserError("trainer.max_steps: is missing; must be a whole number, or -1 for no limit")
-    if interval == 0 and not isinstance(interval, float):  # by a reference, too
-        raise UserError("trainer.val_check_interval=0: must be 1 or more steps, or a share")
-    if isinstance(interval, float) and cfg.trainer.get("check_val_every_n_epoch") is None:
-        raise UserError(
-            f"trainer.val_check_interval={interval}: a share of an epoch needs "
-            "trainer.check_val_every_n_epoch=1; a whole number is of steps"
-        )
-    for name in ("fast_dev_run", "barebones"):
-        if cfg.trainer.get(name):
-            raise UserError(
-                f"trainer.{name}={cfg.trainer[name]}: writes no checkpoint, which the test needs; "
-                "debug=smoke is a short run"
-            )
-    if cfg.trainer.get("gradient_clip_algorithm") not in (None, "norm"):
-        raise UserError(
-            f"trainer.gradient_clip_algorithm={cfg.trainer.gradient_clip_algorithm}: gradients are "
-            "clipped by the norm of each network; leave it out"
-        )
     # else it would never be validated, and have no best checkpoint
     if isinstance(interval, int) and 0 < steps < interval:
-        log.info(
-            "trainer.val_check_interval=%d is more than max_steps=%d: validated at the end",
-            interval,
-            steps,
-        )
+        said = "trainer.val_check_interval=%d is more than max_steps=%d: validated at the end"
+        log.info(said, interval, steps)
         cfg.trainer.val_check_interval = steps
     callbacks: list[Callback] = _build_all(cfg.callbacks, "callbacks")
     for layout in callbacks:
@@ -129,6 +113,31 @@ def build_trainer(job: Job) -> Trainer:
         if not isinstance(logger, TensorBoardLogger):  # whose settings TensorBoardLayout logs
             logger.log_hyperparams(comparable(job))
     return make_trainer(cfg.trainer, callbacks, loggers)
+
+
+def _check_trainer(node: DictConfig) -> None:
+    """Raise UserError for settings of the trainer with which a training would not end in a test."""
+    interval = node.get("val_check_interval")
+    if node.get("max_steps", -1) is None:
+        raise UserError("trainer.max_steps: is missing; must be a whole number, or -1 for no limit")
+    if interval == 0 and not isinstance(interval, float):  # by a reference, too
+        raise UserError("trainer.val_check_interval=0: must be 1 or more steps, or a share")
+    if isinstance(interval, float) and node.get("check_val_every_n_epoch") is None:
+        raise UserError(
+            f"trainer.val_check_interval={interval}: a share of an epoch needs "
+            "trainer.check_val_every_n_epoch=1; a whole number is of steps"
+        )
+    for name in ("fast_dev_run", "barebones"):
+        if node.get(name):
+            raise UserError(
+                f"trainer.{name}={node[name]}: writes no checkpoint, which the test needs; "
+                "debug=smoke is a short run"
+            )
+    if node.get("gradient_clip_algorithm") not in (None, "norm"):
+        raise UserError(
+            f"trainer.gradient_clip_algorithm={node.gradient_clip_algorithm}: gradients are "
+            "clipped by the norm of each network; leave it out"
+        )
 
 
 def _build_all(node: DictConfig, where: str) -> list[Any]:

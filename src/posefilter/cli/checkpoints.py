@@ -17,7 +17,7 @@ from posefilter.cli.plain import resolve, to_plain
 from posefilter.cli.recipe import NOT_KEPT, check_recipe, resolve_foreign, without_pretrained
 from posefilter.cli.trust import Scope
 from posefilter.confidence.calibration import read_calibration
-from posefilter.errors import UserError, find_reason
+from posefilter.errors import UserError, find_reason, naming
 from posefilter.filters.loop import MAX_SEARCHES
 from posefilter.models.base import PoseEstimator, with_lightning
 from posefilter.models.quantization import unpack, unpack_object
@@ -104,16 +104,19 @@ def read_checkpoint(path: str | Path | None) -> dict[str, Any]:
     """
     file = find_checkpoint(path)
     said = f"checkpoint={path}"
-    check_archive(file, said)
-    try:
-        loaded = torch.load(file, map_location="cpu", weights_only=True)
-    # a damaged archive fails in many ways, and pickle raises what it likes
-    except Exception as error:
-        raise UserError(f"{said}: not readable as a checkpoint ({type(error).__name__})") from error
-    checkpoint = check_content(loaded, file, said)
+    with naming(said):
+        check_archive(file)
+        try:
+            loaded = torch.load(file, map_location="cpu", weights_only=True)
+        # a damaged archive fails in many ways, and pickle raises what it likes
+        except Exception as error:
+            why = type(error).__name__
+            raise UserError(f"not readable as a checkpoint ({why})") from error
+        checkpoint = check_content(loaded, file)
+        recipe = check_recipe(checkpoint["recipe"])
     if checkpoint.get("calibration") is not None:
         read_calibration(checkpoint["calibration"], said)
-    return {**checkpoint, "recipe": check_recipe(checkpoint["recipe"], said)}
+    return {**checkpoint, "recipe": recipe}
 
 
 def methods_of(weights: Any, wanted: dict[str, Any]) -> list[PoseEstimator]:
@@ -136,7 +139,7 @@ def method_of(
     recipe = {**recipe, "settings": without_pretrained(settings)}
     state = unpack(checkpoint["state_dict"])
     elements = 4 * sum(value.numel() for value in state.values()) + _SPARE_ELEMENTS
-    with Bounded(elements, 20 * len(state) + _SPARE_TENSORS, "checkpoint"):
+    with Bounded(elements, 20 * len(state) + _SPARE_TENSORS):
         method = build_method(recipe, unpack_object(checkpoint["object_model"]), lightning)
     try:
         missing, foreign = method.load_state_dict(state, strict=False)

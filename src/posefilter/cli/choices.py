@@ -3,9 +3,10 @@ Hydra stumbles over it; torch is not needed for it.
 """
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from itertools import pairwise, product
 from pathlib import Path
+from typing import Any
 
 import yaml
 
@@ -38,16 +39,13 @@ def check_choices(arguments: list[str], conf: Path, command: str | None = None) 
             raise UserError(f"{group}={value}: takes the name of a choice, not a value; {there}")
         if key == "preset" and value != "null":
             check_preset(value, [conf, *choice_folders(arguments)])
-        now = (
-            None
-            if own and (conf / group / f"{value}.yaml").is_file()
-            else rename(argument, command)
-        )
-        if now is not None:
+        is_there = own and (conf / group / f"{value}.yaml").is_file()
+        if not is_there and (now := rename(argument, command)):
             raise UserError(f"{argument}: is now {now}")
-    check_variants(arguments, conf)
-    if command == "train":
-        check_ablations(arguments, conf)
+    typed = dict(a.split("=", 1) for a in arguments if "=" in a)
+    check_variants(typed, conf)
+    if command == "train" and "ablation" in typed:
+        check_ablations(typed, conf)
     check_names([conf, *find_folders(named()), *config_folders(arguments)])
 
 
@@ -67,7 +65,7 @@ def check_added(
     if not added:
         return
     folders = [conf, *choice_folders(typed)]
-    settings = yaml.safe_load((conf / f"{command}.yaml").read_text(encoding="utf-8"))
+    settings = read_settings(conf, command)
     chosen = {name for one in settings["defaults"] if isinstance(one, dict) for name in one}
     groups = {path.name for folder in folders for path in folder.glob("*") if path.is_dir()}
     files = (file for folder in folders for file in folder.glob("*/**/*.yaml"))
@@ -106,9 +104,8 @@ def check_several(group: str, value: str, folders: Sequence[Path]) -> None:
             )
 
 
-def check_variants(arguments: Sequence[str], conf: Path) -> None:
+def check_variants(typed: Mapping[str, str], conf: Path) -> None:
     """Raise UserError for a variant that a method lacks: Hydra would leave it without a preset."""
-    typed = dict(a.split("=", 1) for a in arguments if "=" in a)
     for model, variant in product(*(typed.get(k, "").split(",") for k in ("model", "variant"))):
         known = list_choices(conf / "preset" / model) if re.fullmatch(r"\w+", model) else []
         real = re.fullmatch(r"\w+", variant) and (conf / "variant" / f"{variant}.yaml").is_file()
@@ -119,16 +116,13 @@ def check_variants(arguments: Sequence[str], conf: Path) -> None:
             )
 
 
-def check_ablations(arguments: Sequence[str], conf: Path) -> None:
+def check_ablations(typed: Mapping[str, str], conf: Path) -> None:
     """Raise UserError for a step between variants that is another method's, or changes another
     variant than the one that is typed, which would win.
     """
-    typed = dict(a.split("=", 1) for a in arguments if "=" in a)
-    if "ablation" not in typed:
-        return
     if "experiment" not in typed:  # which may set the method
-        settings = yaml.safe_load((conf / "train.yaml").read_text(encoding="utf-8"))
-        usual = next(one["model"] for one in settings["defaults"] if "model" in one)
+        defaults = read_settings(conf, "train")["defaults"]
+        usual = next(one["model"] for one in defaults if "model" in one)
         typed = {"model": usual, **typed}
     keys = ("ablation", "model", "variant")
     for name, model, variant in product(*(typed.get(key, "").split(",") for key in keys)):
@@ -182,6 +176,12 @@ def typed_plugins(arguments: Sequence[str]) -> list[str]:
     typed = [a.partition("=")[2] for a in arguments if re.match(r"\+{0,2}plugins=", a)]
     words = re.split(r"[\[\],\s'\"]+", typed[-1]) if typed else []
     return [word for word in words if re.fullmatch(r"[A-Za-z_][\w.]*", word) and word != "null"]
+
+
+def read_settings(conf: Path, command: str) -> dict[str, Any]:
+    """Return the settings of a command as they stand in its file, with its list of defaults."""
+    content: dict[str, Any] = yaml.safe_load((conf / f"{command}.yaml").read_text(encoding="utf-8"))
+    return content
 
 
 def list_choices(group: Path) -> list[str]:

@@ -5,18 +5,17 @@ import os
 import sys
 import traceback
 from collections.abc import Mapping
-from contextlib import nullcontext, suppress
+from contextlib import suppress
 from pathlib import Path
 
 import hydra
-from hydra import compose, initialize_config_dir
-from hydra.core.global_hydra import GlobalHydra
+from hydra import compose
 from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf, open_dict
 from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
 
-from posefilter.cli.ablation_configs import register_ablations
+from posefilter.cli.ablations import register_ablations
 from posefilter.cli.arguments import (
     MULTIRUN,
     bracketed,
@@ -36,14 +35,13 @@ from posefilter.cli.components import loosen
 from posefilter.cli.console import logging_for
 from posefilter.cli.explain import explain, explain_hydra, is_launchers
 from posefilter.cli.fit import check_fit
-from posefilter.cli.job import Job, first, plain_name, run_of
+from posefilter.cli.job import Job, first, make_job, plain_name, run_of
 from posefilter.cli.main import COMMANDS, describe_version
+from posefilter.cli.options import add_plugin_folders, open_settings
 from posefilter.cli.plain import to_plain
 from posefilter.cli.ranks import STARTED, is_follower
-from posefilter.cli.replaced import replace_typed
 from posefilter.cli.resume import keep_record, with_resumed
 from posefilter.cli.running import EXPECTED, import_plugin, run_job
-from posefilter.cli.search_path import add_plugin_folders
 from posefilter.cli.trust import Scope, find_folders, trust, trusted
 from posefilter.cli.usage import describe_command
 from posefilter.errors import (
@@ -183,17 +181,12 @@ def register_resolvers() -> None:
 def compose_job(name: str, conf: Path, overrides: list[str], folder: Path) -> Job:
     """Compose a job as the command line would, for tests, tools, and commands that run others."""
     register_resolvers()
-    add_plugin_folders()
-    running = GlobalHydra.instance().is_initialized()
-    with (
-        nullcontext() if running else initialize_config_dir(str(conf.resolve()), version_base="1.3")
-    ):
+    with open_settings(conf):
         cfg = compose(name, [*overrides], return_hydra_config=True)
-    choices = {str(k): str(v) for k, v in cfg.hydra.runtime.choices.items()}
+    choices = cfg.hydra.runtime.choices
     with open_dict(cfg):
         del cfg["hydra"]
-    replace_typed(cfg, overrides)
-    return Job(cfg, choices, list(overrides), folder, name, False)
+    return make_job(cfg, choices, overrides, folder, name)
 
 
 def compose_config(name: str, overrides: list[str]) -> DictConfig:

@@ -31,6 +31,11 @@ def say(console: str, event: str, sentence: str, **content: Any) -> None:
     )
 
 
+def warn(console: str, sentence: str, **content: Any) -> None:
+    """Say what is doubtful."""
+    say(console, "warning", f"warning: {sentence}", **content)
+
+
 def ended(
     console: str, event: str, files: Files, following: Sequence[str] = (), **content: Any
 ) -> None:

@@ -9,8 +9,8 @@ from omegaconf import DictConfig
 
 from posefilter.cli.checkpoints import methods_of
 from posefilter.cli.components import changes
-from posefilter.cli.console import JSON, ended, say
-from posefilter.cli.doubts import find_commonest, say_doubt
+from posefilter.cli.console import JSON, ended, say, warn
+from posefilter.cli.doubts import say_commonest, say_doubt
 from posefilter.cli.job import Job
 from posefilter.cli.machine import settle
 from posefilter.cli.predict import read_costs
@@ -60,7 +60,7 @@ def convert_bag(job: Job) -> None:
                     tally.add(frame, results, cfg.console)
                     writer.write(make_detections(results, frame.header), frame.time)
                     for sentence in reader.warnings[tally.warned :]:
-                        say(cfg.console, "warning", f"warning: {sentence}")
+                        warn(cfg.console, sentence)
                     tally.warned = len(reader.warnings)
                     done = reader.unpaired + reader.early + len(reader.skipped)
                     bar.update(task, completed=tally.images + done)
@@ -73,7 +73,7 @@ def convert_bag(job: Job) -> None:
                 if writer.count and isinstance(error, UserError):
                     raise UserError(f"{error}; {kept}") from error
                 if writer.count:
-                    say(cfg.console, "warning", f"warning: stopped; {kept}", images=writer.count)
+                    warn(cfg.console, f"stopped; {kept}", images=writer.count)
                 raise
     tell(tally, reader, cfg, out)
 
@@ -114,11 +114,9 @@ def tell(tally: Tally, reader: BagReader, cfg: DictConfig, out: Path) -> None:
         said = f"warning: {len(reader.skipped)} messages were left out; the first: "
         say(cfg.console, "skipped", said + reader.skipped[0], skipped=len(reader.skipped))
     for name, count in tally.found.items():
-        most = find_commonest(tally.doubts.get(name, []))
-        if not count and most:
-            reason, number = most
-            said = f"warning: {name} is in no image; in {number} of {tally.images} {reason}"
-            say(cfg.console, "warning", said, object=name, images=number, reason=reason)
+        if not count:
+            doubts = tally.doubts.get(name, [])
+            say_commonest(name, "is in no image", doubts, tally.images, "images", cfg.console)
     if cfg.console != JSON:
         early = f", {reader.early} before the first camera_info" if reader.early else ""
         print(f"{tally.images} images, {reader.unpaired} without depth{early}")

@@ -4,7 +4,7 @@ import re
 from collections.abc import Sequence
 from typing import Any
 
-from posefilter.cli.console import say
+from posefilter.cli.console import warn
 from posefilter.result import Result
 
 
@@ -21,17 +21,27 @@ def say_doubt(result: Result, image: str, warned: set[str], console: str, **fact
     doubt = result.blank or (result.object if result.wrong_size else "")
     if doubt and doubt not in warned:
         warned.add(doubt)
-        said = f"warning: {image}: {'; '.join(result.warnings)}"
         facts |= {"object": result.object, "warnings": list(result.warnings)}
-        say(console, "warning", said, **facts)
+        warn(console, f"{image}: {'; '.join(result.warnings)}", **facts)
 
 
-def find_commonest(warnings: Sequence[str]) -> tuple[str, int] | None:
-    """Return the first of the commonest kind of warning, and how many there are; numbers do not
-    tell kinds apart. None: there are none.
+def say_commonest(
+    name: str, where: str, warnings: Sequence[str], images: int, unit: str, console: str
+) -> None:
+    """Say the commonest kind of warning about an object that was found nowhere; numbers do not tell
+    kinds apart.
+
+    Args:
+        name: The object.
+        where: Where it was not found, as in "is in no image".
+        warnings: All that there are; where there are none, nothing is said.
+        images: How many images there were.
+        unit: What these are called for machines.
+        console: Where to.
     """
     kinds: dict[str, list[str]] = {}
     for warning in warnings:
         kinds.setdefault(re.sub(r"[\d.]+", "", warning), []).append(warning)
-    most = max(kinds.values(), key=len, default=None)
-    return None if most is None else (most[0], len(most))
+    if most := max(kinds.values(), key=len, default=None):
+        said, facts = f"{name} {where}; in {len(most)} of {images} {most[0]}", {unit: len(most)}
+        warn(console, said, object=name, **facts, reason=most[0])

@@ -1,6 +1,5 @@
 """Test a checkpoint, or poses of any other method, on a dataset."""
 
-import shutil
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import replace
@@ -18,8 +17,8 @@ from posefilter.cli.bop_scores import assign_estimates, score_targets, sort_rows
 from posefilter.cli.build import build_data, make_trainer, quiet
 from posefilter.cli.checkpoints import method_of, read_checkpoint
 from posefilter.cli.components import changed, changes, chosen
-from posefilter.cli.console import say, typed
-from posefilter.cli.folders import holds_evaluation, read_results
+from posefilter.cli.console import typed, warn
+from posefilter.cli.folders import keep_training_results, read_results
 from posefilter.cli.job import Job
 from posefilter.cli.learned import DATA, list_learned
 from posefilter.cli.machine import settle
@@ -73,7 +72,7 @@ def evaluate(job: Job) -> float:
     size = metrics.get("apparent_size") or {}
     mismatch = describe_mismatch(size, metrics["data"]["root"])
     if mismatch:
-        say(job.cfg.console, "warning", f"warning: {mismatch}", **size)
+        warn(job.cfg.console, mismatch, **size)
     reported = (job.folder / ".hydra").is_dir() and not job.swept
     following = [typed("report", run=job.folder)] if reported else []
     tested = str(job.cfg.estimates or job.cfg.checkpoint)
@@ -101,7 +100,7 @@ def _of_checkpoint(job: Job) -> tuple[dict[str, Any], dict[str, Path]]:
     data.setup("test")
     method.set_object(object_to_judge(data, method.object_model))
     if method.calibration is None and checkpoint.get("calibration") is not None:
-        say(job.cfg.console, "warning", f"warning: no probabilities: {method.calibration_note}")
+        warn(job.cfg.console, f"no probabilities: {method.calibration_note}")
     warn_of_several(data, job.cfg.console)
     warn_of_learned(str(job.cfg.checkpoint), data, job.cfg.console)
     records = Records()
@@ -128,10 +127,10 @@ def warn_of_learned(checkpoint: str, data: PoseDataModule, console: str) -> None
     learned = list_learned(Path(checkpoint).parent.parent / DATA, data)
     if learned:
         sentence = (
-            f"warning: {len(learned)} of the scenes that are tested were learned from by this run "
+            f"{len(learned)} of the scenes that are tested were learned from by this run "
             f"({', '.join(learned[:3])}): the dataset or data.split has changed since"
         )
-        say(console, "warning", sentence, learned=learned)
+        warn(console, sentence, learned=learned)
 
 
 def warn_of_several(data: PoseDataModule, console: str) -> None:
@@ -140,11 +139,11 @@ def warn_of_several(data: PoseDataModule, console: str) -> None:
     several = sum(count > 1 for count in counts.values())
     if several:
         sentence = (
-            f"warning: {several} of {len(counts)} images show several instances of the object; the "
+            f"{several} of {len(counts)} images show several instances of the object; the "
             "one pose of an image is compared with each of them, so that most count as wrong "
             "(predict.py instances=N finds several)"
         )
-        say(console, "warning", sentence, several=several, images=len(counts))
+        warn(console, sentence, several=several, images=len(counts))
 
 
 def judge_absent(method: PoseEstimator, data: PoseDataModule, limit: int) -> None:
@@ -261,12 +260,12 @@ def warn_of_frame(own: float, other: float, console: str) -> None:
     """
     if other < 0.5 * own:
         sentence = (
-            f"warning: the poses fit the meshes' frames (median ADD {other:.1f} mm) better than "
+            f"the poses fit the meshes' frames (median ADD {other:.1f} mm) better than "
             f"the dataset's ({own:.1f} mm), in which they are scored: predict.py and track.py "
             "frames=... write poses of the mesh's frame, evaluate.py and track.py data=... of the "
             "dataset's"
         )
-        say(console, "warning", sentence, median_mm=own, median_mm_in_mesh_frame=other)
+        warn(console, sentence, median_mm=own, median_mm_in_mesh_frame=other)
 
 
 def data_settings(
@@ -361,15 +360,3 @@ def object_to_judge(data: PoseDataModule, own: ObjectModel) -> ObjectModel:
         symmetries=theirs.symmetries,
         parts=theirs.parts,
     )
-
-
-def keep_training_results(folder: Path) -> None:
-    """Set what a run's own test has written aside, before an evaluation in its folder writes
-    others: `metrics_train.json`, `errors_train.csv`.
-    """
-    if not (folder / "metrics.json").is_file() or holds_evaluation(folder):
-        return
-    for name in ("metrics.json", ERRORS):
-        path = folder / name
-        if path.is_file():
-            shutil.copy2(path, path.with_stem(f"{path.stem}_train"))

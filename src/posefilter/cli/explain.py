@@ -67,21 +67,10 @@ def explain(error: BaseException, name: str, conf: Path, arguments: list[str]) -
         options = sorted(one for one in error.options if not one.startswith("_"))
         return say_no_choice(group, choice, options)
     if isinstance(error, ConfigCompositionException):
-        found = re.search(r"Could not override '([^']+)'", text)
-        if found:
+        if found := re.search(r"Could not override '([^']+)'", text):
             # within a mapping, the cause names the key: tracker={rounds: 2}
             key = str(getattr(error.__cause__, "full_key", None) or found[1])
-            key = re.sub(r"\[(\d+)\]", r".\1", key)
-            new = rename_missing(key, name)
-            if new is not None:
-                return f"{key}: is now {new}"
-            cfg = compose_without(found[1], name, conf, arguments)
-            section, _, last = key.rpartition(".")
-            target = OmegaConf.select(cfg, f"{section}._target_", throw_on_resolution_failure=False)
-            new = rename_argument(target, last)
-            if new is not None:
-                return f"{key}: is now {section}.{new}"
-            return f"{key}: there is no such setting{near(key, known_keys(cfg, key))}"
+            return _explain_missing(key, found[1], name, conf, arguments)
         if found := _THERE.match(text):
             added = [a for a in arguments if a.startswith(f"+{found[1]}=")]
             if added:  # else a file's list of defaults lacks `override`, as Hydra says
@@ -104,6 +93,19 @@ def explain(error: BaseException, name: str, conf: Path, arguments: list[str]) -
         # a preset sets it for another choice
         return f"{first_line(error)}; '~{found[1]}' leaves it out"
     return first_line(error)
+
+
+def _explain_missing(key: str, typed: str, name: str, conf: Path, arguments: list[str]) -> str:
+    """Return what a setting that there is not is called today, or which is the nearest."""
+    key = re.sub(r"\[(\d+)\]", r".\1", key)
+    if new := rename_missing(key, name):
+        return f"{key}: is now {new}"
+    cfg = compose_without(typed, name, conf, arguments)
+    section, _, last = key.rpartition(".")
+    target = OmegaConf.select(cfg, f"{section}._target_", throw_on_resolution_failure=False)
+    if new := rename_argument(target, last):
+        return f"{key}: is now {section}.{new}"
+    return f"{key}: there is no such setting{near(key, known_keys(cfg, key))}"
 
 
 def _explain_yaml(error: MarkedYAMLError) -> str:

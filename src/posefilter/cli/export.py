@@ -8,7 +8,7 @@ from typing import Any
 
 from posefilter.cli.checkpoints import is_calibrated_filter, method_of, read_checkpoint
 from posefilter.cli.components import changed, changes, chosen
-from posefilter.cli.console import ended, say, typed_prediction
+from posefilter.cli.console import ended, typed_prediction, warn
 from posefilter.cli.evaluate import OF_THE_CHECKPOINT
 from posefilter.cli.files import pack_whole
 from posefilter.cli.job import Job
@@ -38,9 +38,8 @@ def export(job: Job) -> None:
     before = recipe["settings"]
     recipe["settings"] = changed(before, changes(job.cfg))
     if not is_calibrated_filter(recipe["settings"], before) and stripped.pop("calibration", None):
-        reason = "it was made for another filter (calibrate.py)"
-        sentence = f"warning: the calibration is left out: {reason}"
-        say(job.cfg.console, "warning", sentence, calibration="left out")
+        said = "the calibration is left out: it was made for another filter (calibrate.py)"
+        warn(job.cfg.console, said, calibration="left out")
     recipe["choices"] = {**recipe["choices"], **chosen(job)}
     size = write_weights(stripped, out, job.cfg.max_mb)
     following = [typed_prediction(out)]

@@ -21,12 +21,12 @@ from omegaconf.errors import InterpolationResolutionError
 from posefilter.capabilities import MEANINGS, Declared, find_missing, read_declared
 from posefilter.cli.instantiate import locate
 from posefilter.cli.options import Groups, Option, list_places, list_targets, open_groups
-from posefilter.cli.plain import find
+from posefilter.cli.plain import find, map_values
 from posefilter.cli.trust import Scope, check_name, is_component, is_listed, is_plugin
 from posefilter.errors import UserError
 
 _LINK = re.compile(r"\$\{([\w.]+)\}")
-_DEEPEST = 32  # of nested settings
+_DEEPEST = 16  # reference to a reference
 
 
 class Component(NamedTuple):
@@ -76,21 +76,17 @@ def check_fit(settings: DictConfig, choices: Mapping[str, str], scope: Scope) ->
         raise broken
 
 
-def resolve_known(tree: Any, place: str) -> Any:
+def resolve_known(tree: Any, place: str, depth: int = 0) -> Any:
     """Return the part of plain settings at a place, all references in it replaced that can be."""
 
-    def walk(node: Any, depth: int) -> Any:
-        if isinstance(node, dict):
-            return {key: walk(value, depth + 1) for key, value in node.items()}
-        if isinstance(node, list):
-            return [walk(value, depth + 1) for value in node]
-        link = _LINK.fullmatch(node) if isinstance(node, str) else None
-        if link is None or depth > _DEEPEST:  # settings that refer to themselves have no end
-            return node
-        found = find(tree, link[1])
-        return node if found is None else walk(found, depth + 1)
+    def follow(value: Any, _: str) -> Any:
+        link = _LINK.fullmatch(value) if isinstance(value, str) else None
+        if link is None or depth == _DEEPEST:  # settings that refer to themselves have no end
+            return value
+        found = resolve_known(tree, link[1], depth + 1)
+        return value if found is None else found
 
-    return walk(find(tree, place), 0)
+    return map_values(find(tree, place), follow)
 
 
 def declared_by(target: str, key: str, scope: Scope) -> Declared:

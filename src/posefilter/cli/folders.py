@@ -1,6 +1,7 @@
 """Folders that commands write to: what is in them is not overwritten, and none is left empty."""
 
 import json
+import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from itertools import count
@@ -145,6 +146,17 @@ def move_evaluation(folder: Path) -> Path | None:
         if (folder / own).is_file():
             (folder / own).replace(folder / name)
     return place
+
+
+def keep_training_results(folder: Path) -> None:
+    """Set what a run's own test has written aside, before an evaluation in its folder writes
+    others: `metrics_train.json`, `errors_train.csv`.
+    """
+    if not (folder / "metrics.json").is_file() or holds_evaluation(folder):
+        return
+    for own, name in _OWN_RESULTS.items():
+        if (folder / name).is_file():
+            shutil.copy2(folder / name, folder / own)
 
 
 def own_metrics(folder: Path) -> dict[str, Any]:

@@ -1,13 +1,15 @@
 """What a command is asked to do."""
 
 import re
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
-from omegaconf import DictConfig, ListConfig, OmegaConf
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from omegaconf import DictConfig, ListConfig, OmegaConf, open_dict
 from omegaconf.errors import OmegaConfBaseException
 
 from posefilter.cli.plain import resolve, to_plain
@@ -34,6 +36,10 @@ _NEEDED = {
 }
 
 
+# mappings that the command line replaces whole, where Hydra would merge them with the defaults
+_WHOLE = ("data.split",)
+
+
 @dataclass(frozen=True)
 class Job:
     """One run of one command."""
@@ -44,6 +50,46 @@ class Job:
     folder: Path  # where its files go
     name: str  # of the command
     swept: bool  # one of several that `-m` started
+
+
+def make_job(
+    cfg: DictConfig,
+    choices: Mapping[Any, Any],
+    overrides: Sequence[str],
+    folder: Path,
+    name: str,
+    swept: bool = False,
+) -> Job:
+    """Return a job of settings as Hydra has composed them; they are changed in place."""
+    _replace_typed(cfg, overrides)
+    chosen = {str(group): str(choice) for group, choice in choices.items()}
+    return Job(cfg, chosen, list(overrides), folder, name, swept)
+
+
+def _replace_typed(cfg: DictConfig, overrides: Sequence[str]) -> None:
+    """Keep of each mapping in `_WHOLE` only what was typed, once it was typed whole.
+
+    `data.split={test: 1.0}` means that and nothing else: the default shares of train and val are
+    not added. `data.split.test=0.5` changes one share and leaves the others.
+
+    Args:
+        cfg: The composed configuration, changed in place.
+        overrides: The command line's overrides.
+    """
+    for key in _WHOLE:
+        own = [text for text in overrides if text.lstrip("+~").startswith((f"{key}=", f"{key}."))]
+        typed: set[str] | None = None
+        for override in OverridesParser.create().parse_overrides(own):
+            path, value = override.key_or_group, override.value()
+            if path == key and isinstance(value, dict):
+                typed = {str(name) for name in value}
+            elif typed is not None:
+                typed.add(path.removeprefix(f"{key}."))
+        node = OmegaConf.select(cfg, key, default=None)
+        if typed is not None and isinstance(node, DictConfig):
+            with open_dict(node):
+                for name in set(map(str, node)) - typed:
+                    del node[name]
 
 
 def write_job(job: Job) -> None:

@@ -28,7 +28,7 @@ from posefilter.cli.job import Job, write_job
 from posefilter.cli.machine import settle
 from posefilter.cli.measure_speed import Speed, measure_speed
 from posefilter.cli.onboarded_mesh import find_and_draw, find_declared, read_onboarded, write_meshes
-from posefilter.cli.plain import key_of
+from posefilter.cli.plain import key_of, resolve
 from posefilter.cli.report import compared, write_page
 from posefilter.cli.resume import LAST
 from posefilter.cli.reuse import step_of
@@ -130,7 +130,8 @@ class Onboarding:
         """Return all that decides a stage's result."""
         known = {**self.digests, "frames": self.frames, "name": self.mesh.name}
         return {
-            key: known[key] if key in known else _plain(self.cfg.get(key)) for key in stage.settings
+            key: known[key] if key in known else resolve(self.cfg.get(key))
+            for key in stage.settings
         }
 
     def job(self, folder: Path, *more: str) -> Job:
@@ -156,7 +157,7 @@ class Onboarding:
             f"threads={'null' if self.cfg.threads is None else self.cfg.threads}",
             f"console={self.cfg.console}",
         ]
-        start = _plain(self.cfg.warm_start)
+        start = resolve(self.cfg.warm_start)
         if isinstance(start, list):
             words.append("warm_start=[" + ",".join(map(quote, start)) + "]")
         elif start is not None:
@@ -387,10 +388,6 @@ def _split(frames: int) -> str:
     val = round(min(0.1, _VAL_FRAMES / frames), 4)
     test = round(min(0.2, _TEST_FRAMES / frames), 4)
     return f"{{train: {1 - val - test:.4f}, val: {val}, test: {test}}}"
-
-
-def _plain(value: Any) -> Any:
-    return OmegaConf.to_container(value) if OmegaConf.is_config(value) else value
 
 
 _DISTRACTORS = ("distractor_meshes", "distractor_scale")

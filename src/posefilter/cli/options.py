@@ -3,16 +3,20 @@
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, nullcontext, suppress
 from functools import cache
+from pathlib import Path
 from typing import Any, NamedTuple
 
 from hydra import initialize_config_dir
+from hydra.core.config_search_path import ConfigSearchPath
 from hydra.core.global_hydra import GlobalHydra
+from hydra.core.plugins import Plugins
 from hydra.errors import HydraException
+from hydra.plugins.search_path_plugin import SearchPathPlugin
 from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
 
 from posefilter.cli.plain import to_plain
-from posefilter.cli.search_path import add_plugin_folders
+from posefilter.cli.trust import find_folders, trusted
 from posefilter.paths import find_conf
 
 
@@ -97,11 +101,35 @@ def _merge(old: Any, new: Any) -> Any:
     return {**old, **{k: _merge(old[k], v) if k in old else v for k, v in new.items()}}
 
 
+class PluginFolders(SearchPathPlugin):
+    """Has Hydra look for choices in the folder `conf` of packages that the user trusts, too: after
+    the project's own.
+    """
+
+    def manipulate_search_path(self, search_path: ConfigSearchPath) -> None:
+        """Add the folders."""
+        for folder in find_folders(trusted()):
+            search_path.append("posefilter.plugins", f"file://{folder}")
+
+
+def add_plugin_folders() -> None:
+    """Have Hydra find the choices of plug-ins in all that it composes from now on."""
+    Plugins.instance().register(PluginFolders)
+
+
+@contextmanager
+def open_settings(conf: Path) -> Iterator[None]:
+    """Have Hydra compose from a folder and plug-ins, unless a command is running: then from its."""
+    add_plugin_folders()
+    running = GlobalHydra.instance().is_initialized()
+    with (
+        nullcontext() if running else initialize_config_dir(str(conf.resolve()), version_base="1.3")
+    ):
+        yield
+
+
 @contextmanager
 def open_groups() -> Iterator[Groups]:
     """Yield the groups of the running command, else of the project's own folder and plug-ins."""
-    add_plugin_folders()
-    running = GlobalHydra.instance().is_initialized()
-    conf = str(find_conf().resolve())
-    with nullcontext() if running else initialize_config_dir(conf, version_base="1.3"):
+    with open_settings(find_conf()):
         yield Groups(GlobalHydra.instance().config_loader())

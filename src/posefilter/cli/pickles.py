@@ -28,25 +28,22 @@ _TUPLES = {"TUPLE1": 1, "TUPLE2": 2, "TUPLE3": 3}
 _MARK = -1
 
 
-def check_pickle(data: bytes, said: str) -> None:
+def check_pickle(data: bytes) -> None:
     """Raise UserError unless a pickle has no more than checkpoints have: plain values, tensors,
     keys that are texts or small numbers, and tuples that are not made of each other.
 
     Args:
         data: The pickle.
-        said: How the user named the checkpoint, for messages.
     """
     if len(data) > _LARGEST:
-        raise UserError(
-            f"{said}: what it says of itself is {len(data):,} bytes, at most {_LARGEST:,}"
-        )
+        raise UserError(f"what it says of itself is {len(data):,} bytes, at most {_LARGEST:,}")
     try:
         flaw = _find_flaw(data)
     # the bytes decide what breaks: an empty stack, a mark that is not there, a cut argument
     except (ValueError, IndexError, KeyError, TypeError) as error:
-        raise UserError(f"{said}: not readable as a checkpoint (a broken pickle)") from error
+        raise UserError("not readable as a checkpoint (a broken pickle)") from error
     if flaw:
-        raise UserError(f"{said}: not readable as a checkpoint ({flaw})")
+        raise UserError(f"not readable as a checkpoint ({flaw})")
 
 
 def _find_flaw(data: bytes) -> str:

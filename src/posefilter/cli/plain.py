@@ -1,6 +1,6 @@
 """Settings as plain data."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
@@ -29,6 +29,21 @@ def map_values(node: Any, change: Callable[[Any, str], Any], place: str = "") ->
     if isinstance(node, list):
         return [map_values(value, change, f"{place}[{i}]") for i, value in enumerate(node)]
     return change(node, place)
+
+
+def walk(node: Any) -> Iterator[tuple[str, int, Any]]:
+    """Yield (path, depth, value) of every node, itself first, lazily and without recursion."""
+    stack = [("", 0, node)]
+    while stack:
+        path, depth, value = stack.pop()
+        yield path, depth, value
+        if isinstance(value, Mapping):
+            stack += [
+                (f"{path}.{key}" if isinstance(key, str) else f"{path}.?", depth + 1, v)
+                for key, v in value.items()
+            ]
+        elif isinstance(value, list | tuple | set):
+            stack += [(f"{path}[{i}]", depth + 1, v) for i, v in enumerate(value)]
 
 
 def key_of(override: str) -> str:

@@ -48,6 +48,13 @@ _PROBABILITY = (
     "that the object is in the image and the pose within 0.1 diameters (ADD), calibrated on "
     "validation scenes of which half showed the object; presence: that it is in the image"
 )
+# what an answer tells, null where there is nothing to say
+_TOLD = (
+    "object", "instance", "verdict", "probability", "presence", "probability_is", "pose_tolerance",
+    "probability_within", "costs", "camera_from_object", "rotation", "translation_mm", "score",
+    "score_is", "warnings", "apparent_size", "belief", "belief_file", "visible_pixels", "seconds",
+    "frame", "checkpoint", "rgb", "depth",
+)  # fmt: skip
 _SURFACE = PoseTolerance(add_s=0.1)
 _CALIBRATED = (
     "where the pose is if the estimate is right (within 0.1 diameters), as wide as the errors of "
@@ -307,28 +314,14 @@ def describe_belief(result: Result) -> dict[str, Any]:
 def describe_absent(
     name: str, score_is: str, costs: Costs, checkpoint: str | Path, job: Job
 ) -> dict[str, Any]:
-    """Return what is written of an object that is not found: null where there is nothing to say."""
-    return {
+    """Return what is written of an object that is not found."""
+    return dict.fromkeys(_TOLD) | {
         "object": name,
-        "instance": None,
         "verdict": "absent",
-        "probability": None,
-        "presence": None,
         "probability_is": _PROBABILITY,
-        "pose_tolerance": None,
-        "probability_within": None,
         "costs": asdict(costs),
-        "camera_from_object": None,
-        "rotation": None,
-        "translation_mm": None,
-        "score": None,
         "score_is": score_is,
         "warnings": [],
-        "apparent_size": None,
-        "belief": None,
-        "belief_file": None,
-        "visible_pixels": None,
-        "seconds": None,
         "frame": _FRAME,
         "checkpoint": str(checkpoint),
         "rgb": str(job.cfg.rgb),

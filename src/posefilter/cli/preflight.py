@@ -6,6 +6,7 @@ from typing import Any
 
 from omegaconf import DictConfig, ListConfig, OmegaConf
 
+from posefilter.cli.arguments import TYPED
 from posefilter.cli.plain import find
 from posefilter.errors import UserError, missing_package
 from posefilter.weights import expand_weights, find_weights, is_several
@@ -35,7 +36,6 @@ _LOGGERS = {
     "lightning.pytorch.loggers.MLFlowLogger": "mlflow",
     "lightning.pytorch.loggers.WandbLogger": "wandb",
 }
-_SHOWN = {"sweep_folder": "sweep"}  # as it is typed
 _VIDEOS = ("mp4", "gif", "none")  # as figures/video.py writes them
 # by command: settings that must be given, and how
 _NEEDED = {
@@ -103,7 +103,7 @@ def check_files(command: str, cfg: DictConfig) -> None:
         if key == "data.root" and find(cfg, "data.generate") is not None:
             continue  # it is rendered
         found = "is a file, and no folder" if Path(str(folder)).exists() else "no such folder"
-        raise UserError(f"{_SHOWN.get(key, key)}={folder}: {found}")
+        raise UserError(f"{TYPED.get(key, key)}={folder}: {found}")
 
 
 def _check_bag(cfg: DictConfig) -> None:
@@ -172,7 +172,7 @@ def _take_as_text(cfg: DictConfig, key: str) -> None:
     if isinstance(value, int | float) and not isinstance(value, bool):
         OmegaConf.update(cfg, key, str(value))
     elif not isinstance(value, str | None):
-        raise UserError(f"{_SHOWN.get(key, key)}={value}: must be the name of a file or folder")
+        raise UserError(f"{TYPED.get(key, key)}={value}: must be the name of a file or folder")
 
 
 def _find_all(weights: Any) -> None:

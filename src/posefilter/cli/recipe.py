@@ -8,13 +8,13 @@ its numbers are such as methods have.
 
 import math
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from omegaconf import OmegaConf
 
-from posefilter.cli.plain import find, map_values, resolve
+from posefilter.cli.plain import find, map_values, resolve, walk
 from posefilter.cli.renamed import find_renamed, upgrade
 from posefilter.cli.trust import DATA_NAMES, is_plugin
 from posefilter.errors import UserError
@@ -53,43 +53,40 @@ def resolve_foreign(settings: dict[str, Any]) -> dict[str, Any]:
     return dict(map_values(settings, resolve_value))
 
 
-def check_recipe(recipe: Any, said: str) -> dict[str, Any]:
+def check_recipe(recipe: Any) -> dict[str, Any]:
     """Return a recipe that is safe to build from, without what it must not decide.
 
     Args:
         recipe: What the checkpoint holds under that name.
-        said: How the user named the checkpoint, for messages.
 
     Raises:
         UserError: It is no recipe, too large, or holds an interpolation that is no reference to
             another of its settings.
     """
     if not (isinstance(recipe, dict) and set(recipe) == {"choices", "settings"}):
-        raise UserError(f"{said}: its recipe should hold choices and settings, nothing else")
+        raise UserError("its recipe should hold choices and settings, nothing else")
     choices, settings = recipe["choices"], recipe["settings"]
     if not (isinstance(choices, dict) and isinstance(settings, dict)):
-        raise UserError(f"{said}: its recipe's choices and settings should be mappings")
+        raise UserError("its recipe's choices and settings should be mappings")
     foreign = sorted(str(key) for key in settings if key in NOT_KEPT)
     if foreign:
-        raise UserError(
-            f"{said}: its recipe holds {foreign[0]}, which a checkpoint does not decide"
-        )
-    for count, (path, depth, value) in enumerate(_nodes(recipe)):
+        raise UserError(f"its recipe holds {foreign[0]}, which a checkpoint does not decide")
+    for count, (path, depth, value) in enumerate(walk(recipe)):
         if depth > _DEEPEST:
-            raise UserError(f"{said}: its recipe is nested more than {_DEEPEST} deep")
+            raise UserError(f"its recipe is nested more than {_DEEPEST} deep")
         if count > _MOST_NODES:
-            raise UserError(f"{said}: its recipe holds more than {_MOST_NODES} settings")
-        _check_value(path, value, said)
+            raise UserError(f"its recipe holds more than {_MOST_NODES} settings")
+        _check_value(path, value)
     old = find_renamed(recipe)
     if old is not None:
         raise UserError(
-            f"{said}: was written by an earlier version ({old[0]} is now {old[1]}); train it again"
+            f"was written by an earlier version ({old[0]} is now {old[1]}); train it again"
         )
     if not all(isinstance(choice, str) and _KEY.fullmatch(choice) for choice in choices.values()):
-        raise UserError(f"{said}: its recipe's choices should be names")
+        raise UserError("its recipe's choices should be names")
     now = upgrade(recipe)
     settings = _without_selects(now["settings"])
-    _check_expansion(settings, said)
+    _check_expansion(settings)
     return {"choices": now["choices"], "settings": settings}
 
 
@@ -112,7 +109,7 @@ def check_data(data: Mapping[str, Any], typed: Mapping[str, Any]) -> None:
         typed: The values that the user typed, by key, such as `root`.
     """
     own = set(map(str, typed.values()))
-    for path, _, value in _nodes(data):
+    for path, _, value in walk(data):
         key = path.lstrip(".")
         if (
             key.rpartition(".")[2] == "_target_"
@@ -145,48 +142,30 @@ def _below_outputs(value: str) -> bool:
     return len(parts) > 1 and parts[0] == "outputs"
 
 
-def _nodes(node: Any) -> Iterator[tuple[str, int, Any]]:
-    """Yield (path, depth, value) of every node, lazily and without recursion."""
-    stack = [("", 0, node)]
-    while stack:
-        path, depth, value = stack.pop()
-        yield path, depth, value
-        if isinstance(value, Mapping):
-            stack += [
-                (f"{path}.{key}" if isinstance(key, str) else f"{path}.?", depth + 1, v)
-                for key, v in value.items()
-            ]
-        elif isinstance(value, list | tuple):
-            stack += [(f"{path}[{i}]", depth + 1, v) for i, v in enumerate(value)]
-
-
-def _check_value(path: str, value: Any, said: str) -> None:
+def _check_value(path: str, value: Any) -> None:
     where = path.lstrip(".").removeprefix("settings.")[:100]
     if isinstance(value, dict):
         wrong = [key for key in value if not (isinstance(key, str) and _KEY.fullmatch(key))]
         if wrong:
-            raise UserError(f"{said}: its recipe has the key {str(wrong[0])[:40]!r}")
+            raise UserError(f"its recipe has the key {str(wrong[0])[:40]!r}")
     elif isinstance(value, str):
         if len(value) > _LONGEST or not value.isprintable():
-            raise UserError(
-                f"{said}: its recipe's {where} is no plain text of at most {_LONGEST} letters"
-            )
+            raise UserError(f"its recipe's {where} is no plain text of at most {_LONGEST} letters")
         # a select stands alone: within a text, nobody would see what it refers to
         if "${" in _REFERENCE.sub("", value) and not _SELECT.fullmatch(value):
             raise UserError(
-                f"{said}: its recipe's {where}={value[:60]!r} may only refer to another setting, "
-                f"such as ${{filter}}"
+                f"its recipe's {where}={value[:60]!r} may only refer to another setting, such as "
+                "${filter}"
             )
     elif isinstance(value, int) and not isinstance(value, bool):
         if abs(value) > LIMITS.get(where.rpartition(".")[2], MOST_WHOLE):
-            raise UserError(f"{said}: its recipe's {where}={str(value)[:30]} is too large")
+            raise UserError(f"its recipe's {where}={str(value)[:30]} is too large")
     elif isinstance(value, float):
         if not math.isfinite(value):
-            raise UserError(f"{said}: its recipe's {where}={value} is not finite")
+            raise UserError(f"its recipe's {where}={value} is not finite")
     elif not (value is None or isinstance(value, bool | list)):
         raise UserError(
-            f"{said}: its recipe's {where} is a {type(value).__name__}; only plain "
-            f"settings may stand there"
+            f"its recipe's {where} is a {type(value).__name__}; only plain settings may stand there"
         )
 
 
@@ -206,14 +185,14 @@ def _without_selects(settings: dict[str, Any]) -> dict[str, Any]:
     return dict(map_values(settings, refer))
 
 
-def _check_expansion(settings: dict[str, Any], said: str) -> None:
+def _check_expansion(settings: dict[str, Any]) -> None:
     """Raise UserError where references would never end, or grow out of bounds."""
     stack, count = [(0, settings)], 0
     while stack:
         depth, node = stack.pop()
         count += 1
         if depth > 4 * _DEEPEST or count > 10 * _MOST_NODES:
-            raise UserError(f"{said}: its recipe's settings refer to each other without end")
+            raise UserError("its recipe's settings refer to each other without end")
         if isinstance(node, dict | list):
             inner = node.values() if isinstance(node, dict) else node
             stack += [(depth + 1, value) for value in inner]

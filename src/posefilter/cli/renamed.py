@@ -92,6 +92,7 @@ KEYS = {
         for old, new in (("start", "initial_sigma"), ("stop", "final_sigma"), ("points", "pixels"))
     },
 }
+_NAMES = GROUPS | KEYS
 # settings of single commands
 COMMANDS = {
     "calibrate": {"replace": "overwrite"},
@@ -318,7 +319,8 @@ def rename(override: str, command: str | None = None) -> str | None:
     sign, key, equals, value = _split(override)
     if key == "budget":
         return _BUDGET + value.partition("/")[0]
-    new = _rename_setting(key, command)
+    commands = (own for name, own in COMMANDS.items() if command in (None, name))
+    new = next((own[key] for own in commands if key in own), key)
     # a name of before that, too
     while (newer := _rename_key(new)) != new:
         new = newer
@@ -349,17 +351,9 @@ def _split(override: str) -> tuple[str, str, str, str]:
     return found[1], found[2], found[3], found[4]
 
 
-def _rename_setting(key: str, command: str | None) -> str:
-    """Return what a setting is called today: of a command, or of all that have it."""
-    own = [one for name, one in COMMANDS.items() if command in (None, name) and key in one]
-    return own[0][key] if own else _rename_key(key)
-
-
 def _rename_key(key: str) -> str:
-    if key in KEYS:
-        return KEYS[key]
-    if key in GROUPS:
-        return GROUPS[key]
+    if key in _NAMES:
+        return _NAMES[key]
     head, dot, rest = key.partition(".")
     if not dot:
         return key
@@ -385,7 +379,7 @@ def find_renamed(recipe: Mapping[str, Any]) -> tuple[str, str] | None:
         recipe: Its `choices` and `settings`.
     """
     old = [*recipe.get("choices", ()), *recipe.get("settings", ())]
-    return next(((n, _rename_key(n)) for n in map(str, old) if n in GROUPS or n in KEYS), None)
+    return next(((n, _rename_key(n)) for n in map(str, old) if n in _NAMES), None)
 
 
 def upgrade(recipe: Mapping[str, Any]) -> dict[str, Any]:

@@ -9,6 +9,7 @@ from hydra.errors import HydraException
 from hydra.types import RunMode
 from omegaconf.errors import OmegaConfBaseException
 
+from posefilter.cli.arguments import TYPED
 from posefilter.cli.console import ended
 from posefilter.cli.job import Job
 from posefilter.cli.plain import to_plain
@@ -24,15 +25,13 @@ from posefilter.report.settings import Change, compare_settings
 from posefilter.report.sweep_page import make_sweep_page
 from posefilter.report.sweeps import find_best_job, read_sweep
 
-# on the command line -> in the configuration
-KEYS = {"run": "run", "runs": "runs", "sweep": "sweep_folder"}
-
 
 def report(job: Job) -> None:
     """Write report.html and its charts as PNGs into `out`; else into the run or sweep, or the
     second of two runs.
     """
-    given = {key: job.cfg[name] for key, name in KEYS.items() if job.cfg[name] is not None}
+    keys = ("run", "runs", "sweep_folder")
+    given = {TYPED.get(key, key): job.cfg[key] for key in keys if job.cfg[key] is not None}
     if len(given) != 1:
         raise UserError(
             "give one of run=RUN, a run's folder, sweep=DIR, a sweep's, and runs=A,B, "

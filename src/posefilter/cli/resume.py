@@ -11,7 +11,7 @@ from hydra.errors import HydraException
 from posefilter.cli.arguments import quoted
 from posefilter.cli.plain import find, key_of
 from posefilter.cli.renamed import update
-from posefilter.errors import BadData, UserError
+from posefilter.errors import BadData, UserError, naming
 from posefilter.limits import read_bytes, read_yaml
 from posefilter.paths import check_links, stays_inside
 
@@ -78,8 +78,9 @@ def with_resumed(arguments: list[str]) -> list[str]:
     added = {key_of(one) for one in before if one.startswith("+")}
     # `~key` of what the run had added: it is left out, and nothing is there to be deleted
     arguments = [a for a in arguments if not (a.startswith("~") and key_of(a) in added)]
-    for override in kept:
-        check_override(override, folder)
+    with naming(f"resume={folder}"):
+        for override in kept:
+            check_override(override)
     # a choice of `sweep` brings the jobs' settings, and would start them all
     alone = ["hydra.mode=RUN"] if any(key_of(one) == "sweep" for one in kept) else []
     return [*kept, *arguments, f"out={folder}", *alone]
@@ -112,7 +113,7 @@ def overrides_of(folder: Path) -> list[str]:
     return before
 
 
-def check_override(override: str, folder: Path) -> None:
+def check_override(override: str) -> None:
     """Raise UserError where a setting that a run's folder brings is one that only the user may
     type.
 
@@ -122,38 +123,32 @@ def check_override(override: str, folder: Path) -> None:
     found = _OVERRIDE.fullmatch(override)
     if found is None or not override.isprintable() or re.match(r"hydra\b", found[2]):
         raise UserError(
-            f"resume={folder}: {override[:80]!r} in its .hydra/overrides.yaml is not a "
-            f"setting of a training run"
+            f"{override[:80]!r} in its .hydra/overrides.yaml is not a setting of a training run"
         )
     key, value = found[2], (found[3] or "").strip("'\"")
     if re.search(r"\$\{[^}]*:", value):
-        raise UserError(
-            f"resume={folder}: its {key} calls a function; if that is right, type "
-            f"{key}=... yourself"
-        )
+        raise UserError(f"its {key} calls a function; if that is right, type {key}=... yourself")
     words = [word for word in re.split(r"[\[\]{},\s'\"]|:(?!//)", value) if word]
     sends = key == "logger" and not {*words}.isdisjoint(_SENDING)
     if sends or key.startswith("logger."):
         raise UserError(
-            f"resume={folder}: its {key}={value} may send results elsewhere; if it is right, "
-            f"type it as well"
+            f"its {key}={value} may send results elsewhere; if it is right, type it as well"
         )
     place = key.rpartition(".")[2] in _PLACES and value not in ("", "null")
     if place or not all(stays_inside(word, Path()) for word in words):
         raise UserError(
-            f"resume={folder}: its {key}={value} lies outside of the working folder; if it is "
-            f"right, type it as well"
+            f"its {key}={value} lies outside of the working folder; if it is right, type it as well"
         )
 
 
-def list_unkept(overrides: list[str], folder: Path) -> list[str]:
+def list_unkept(overrides: list[str]) -> list[str]:
     """Return those overrides of a run that must be typed again to resume it, see `check_override`,
     as they are typed in a shell.
     """
     words = []
     for override in (one for one in overrides if key_of(one) not in _DROPPED):
         try:
-            check_override(override, folder)
+            check_override(override)
         except UserError:
             words.append(shlex.quote(override))
     return words

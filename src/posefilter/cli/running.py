@@ -25,9 +25,8 @@ from posefilter.cli.folders import (
     read_results,
     remove_if_empty,
 )
-from posefilter.cli.job import Job, check_settings
+from posefilter.cli.job import Job, check_settings, make_job
 from posefilter.cli.preflight import check_files
-from posefilter.cli.replaced import replace_typed
 from posefilter.cli.trust import Scope, find_folders, installed, named, trust, trusted
 from posefilter.errors import Carrier, UserError
 from posefilter.locks import release
@@ -131,13 +130,11 @@ def use_plugins(cfg: DictConfig) -> None:
         )
     for package in packages:
         trust(package)
-    for package in packages:
-        import_plugin(package)
-    import_installed()
+    import_trusted()
 
 
 def import_trusted() -> None:
-    """Import the plug-ins that the user of the library trusts, and installed ones."""
+    """Import the plug-ins that the user has named himself, and installed ones."""
     for package in sorted(named()):
         import_plugin(package)
     import_installed()
@@ -174,10 +171,8 @@ def import_plugin(package: str) -> None:
 def job_of(cfg: DictConfig) -> Job:
     """Return the job that Hydra has prepared."""
     own = HydraConfig.get()
-    choices = {str(k): str(v) for k, v in own.runtime.choices.items()}
     swept = own.mode is RunMode.MULTIRUN
     # as typed: what an interpolation stands for may be a secret, or not known yet
     typed: Any = OmegaConf.to_container(own.overrides.task, resolve=False)
-    replace_typed(cfg, typed)
     folder, name = Path(own.runtime.output_dir), own.job.config_name or ""
-    return Job(cfg, choices, typed, folder, name, swept)
+    return make_job(cfg, own.runtime.choices, typed, folder, name, swept)

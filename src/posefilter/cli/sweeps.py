@@ -62,7 +62,8 @@ def summarize(folder: Path) -> list[Row]:
     """Write the three files of a sweep's folder; return its rows, none before a job has ended."""
     if not any(any(folder.glob(f"*/**/{mark}")) for mark in ("metrics.json", FAILED)):
         return []
-    from posefilter.report.summary import draw_summary  # Hydra makes this callback in every run
+    # Hydra makes this callback in every run
+    from posefilter.report.sweep_charts import draw_summary
     from posefilter.report.sweeps import COLUMNS, read_sweep
 
     sweep = read_sweep(folder)

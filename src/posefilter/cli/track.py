@@ -13,8 +13,8 @@ from omegaconf import DictConfig, OmegaConf
 
 from posefilter.cli.checkpoints import methods_of
 from posefilter.cli.components import changes
-from posefilter.cli.console import JSON, ended, finite, say, show_table
-from posefilter.cli.doubts import find_commonest, say_doubt
+from posefilter.cli.console import JSON, ended, finite, say, show_table, warn
+from posefilter.cli.doubts import say_commonest, say_doubt
 from posefilter.cli.job import Job
 from posefilter.cli.machine import settle
 from posefilter.cli.plain import resolve
@@ -35,13 +35,7 @@ from posefilter.meshes.ycb import number_objects
 from posefilter.metrics.bop_results import write_poses_csv
 from posefilter.progress import bars
 from posefilter.tracking.motion import ConstantVelocity
-from posefilter.tracking.records import (
-    TrackSummary,
-    compute_figures,
-    describe_row,
-    make_row,
-    write_rows,
-)
+from posefilter.tracking.records import compute_figures, describe_row, make_row, write_rows
 from posefilter.tracking.settings import FilterSettings, TrackerSettings
 from posefilter.tracking.track import TrackResult
 from posefilter.tracking.tracker import Tracker
@@ -94,7 +88,11 @@ def track(job: Job) -> None:
     if not rows:
         raise broken or UserError("no frame could be read; leave on_error=skip out to see why")
     for name in estimator.objects:
-        _say_all_lost(name, [row.result for row in rows if row.result.object == name], cfg)
+        results = [row.result for row in rows if row.result.object == name]
+        if not any(one.is_tracked for one in results):
+            doubts = [warning for one in results for warning in one.warnings]
+            where = "is tracked in no frame"
+            say_commonest(name, where, doubts, len(results), "frames", cfg.console)
     write_rows(folder, [finite(describe_row(row)) for row in rows])
     write_poses_csv(folder / POSES, log.list_poses(rows))
     metrics = {
@@ -145,10 +143,10 @@ def follow(
     say(cfg.console, "video", f"{video.name}: {len(video)} frames", video=video.name)
     for name in video.several:
         sentence = (
-            f"warning: {video.name}: frames show several of {name}; one is tracked, and compared "
-            "with the first that is listed"
+            f"{video.name}: frames show several of {name}; one is tracked, and compared with the "
+            "first that is listed"
         )
-        say(cfg.console, "warning", sentence, video=video.name, object=name)
+        warn(cfg.console, sentence, video=video.name, object=name)
     numbers = number_objects(estimator.objects) | video.ids
     doubted: set[str] = set()  # objects whose size was said to be wrong, and why frames are blank
     watch = bars(shown=cfg.console != JSON, transient=True)
@@ -182,7 +180,7 @@ def read_frames(video: Video, tracker: Tracker, cfg: DictConfig) -> Iterator[Vid
         except UserError as error:
             if not skip:
                 raise UserError(f"{error}; on_error=skip leaves such frames out") from error
-            say(cfg.console, "warning", f"warning: left out: {error}", skipped=str(error))
+            warn(cfg.console, f"left out: {error}", skipped=str(error))
             continue
         if frame is not None:
             yield frame
@@ -201,16 +199,6 @@ def read_frame(video: Video, index: int, tracker: Tracker) -> VideoFrame | None:
         except UserError as error:
             raise UserError(f"frame {frame.name}: {error}") from error
     return frame
-
-
-def _say_all_lost(name: str, results: Sequence[TrackSummary], cfg: DictConfig) -> None:
-    """Say why, where an object is lost in every frame and its guesses are implausible."""
-    if not results or any(one.is_tracked for one in results):
-        return
-    if most := find_commonest([warning for one in results for warning in one.warnings]):
-        reason, frames = most
-        said = f"warning: {name} is tracked in no frame; in {frames} of {len(results)} {reason}"
-        say(cfg.console, "warning", said, object=name, frames=frames, reason=reason)
 
 
 def draw_frame(

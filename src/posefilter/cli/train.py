@@ -298,7 +298,7 @@ def say_stopped(run: Run) -> None:
     job, step = run.job, run.trainer.global_step
     sentence, again = f"stopped at step {step}", None
     if (job.folder / "checkpoints" / LAST).is_file():
-        words = list_unkept(job.overrides, job.folder)
+        words = list_unkept(job.overrides)
         again = " ".join([typed("train", resume=job.folder, **plugins(job)), *words])
         if job.swept:
             again = f"the same command with out={job.folder.parent}"

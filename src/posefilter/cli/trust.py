@@ -74,6 +74,9 @@ class Scope(Enum):
     RECIPE = "a checkpoint"
 
 
+_NAMES = {Scope.CONFIG: _CONFIG_NAMES, Scope.RECIPE: _RECIPE_NAMES}
+
+
 def trust(package: str) -> None:
     """Let settings, and recipes of checkpoints, name what a plug-in package defines, until this
     process ends.
@@ -147,7 +150,7 @@ def is_plugin(name: str) -> bool:
 
 def is_listed(name: str, scope: Scope) -> bool:
     """Tell whether a dotted name is in the explicit list of a scope."""
-    return name in (_CONFIG_NAMES if scope is Scope.CONFIG else _RECIPE_NAMES)
+    return name in _NAMES[scope]
 
 
 def is_component(module: str, scope: Scope) -> bool:
@@ -185,5 +188,5 @@ def check_name(name: str, where: str, scope: Scope) -> None:
 
 def listed_in(module: str, scope: Scope) -> list[str]:
     """Return the names of a module that are in the explicit list of a scope."""
-    names = _CONFIG_NAMES if scope is Scope.CONFIG else _RECIPE_NAMES
-    return sorted(name.rpartition(".")[2] for name in names if name.rpartition(".")[0] == module)
+    places = (name.rpartition(".") for name in _NAMES[scope])
+    return sorted(name for home, _, name in places if home == module)

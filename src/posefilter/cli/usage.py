@@ -10,17 +10,16 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-import yaml
 from hydra.core.config_store import ConfigStore
 
-from posefilter.cli.choices import choice_folders, list_choices
+from posefilter.cli.arguments import TYPED
+from posefilter.cli.choices import choice_folders, list_choices, read_settings
 from posefilter.cli.console import name_program
 from posefilter.cli.main import COMMANDS
 
 _SETTING = re.compile(r"^(\w+): *(.*?) *(?:# *(.*))?$")  # a key at the top of a file
 _UNLISTED = ("generate", "folder", "debug")  # what others are handed on to, or has a line below
 _HIDDEN = ("trainer",)  # groups whose choice the command itself makes
-_TYPED = {"report": {"sweep_folder": "sweep"}}  # settings by the names that are typed
 _MOST_CHOICES = 20
 _INDENT, _NARROWEST, _WIDEST = 26, 60, 120
 _MEANINGS = {
@@ -90,9 +89,8 @@ def describe_command(name: str, conf: Path, arguments: Sequence[str] = ()) -> st
             shown = " ".join(f"[{c}]" if c == group.default else c for c in group.choices)
             lines += _entry(group.name, f"{shown} {_MEANINGS.get(group.name, '')}".rstrip(), width)
     lines += ["", "settings, typed key=value"]
-    typed = _TYPED.get(name, {})
     settings = {
-        f"{typed.get(key, key)}={value}": comment for key, value, comment in list_settings(text)
+        f"{TYPED.get(key, key)}={value}": comment for key, value, comment in list_settings(text)
     }
     for key, comment in {**settings, **_SECTIONS.get(name, {})}.items():
         lines += _entry(key, _shorten(comment, width - _INDENT), width)
@@ -152,8 +150,7 @@ def list_settings(text: str) -> Iterator[tuple[str, str, str]]:
 def _read_defaults(conf: Path, name: str) -> dict[str, str | None]:
     """Return the groups of a file's defaults, with the default choice of each."""
     out: dict[str, str | None] = {}
-    content = yaml.safe_load((conf / f"{name}.yaml").read_text(encoding="utf-8"))
-    for one in content.get("defaults", []):
+    for one in read_settings(conf, name).get("defaults", []):
         if isinstance(one, str) and one != "_self_":
             out |= _read_defaults(conf, one)
         elif isinstance(one, dict):

@@ -8,9 +8,19 @@ from posefilter.metrics.scores import overall
 
 def compute_checkpoint_score(results: dict[str, Any]) -> float:
     """Return the score by which checkpoints are compared, from metrics.json (see `overall`)."""
-    add = results.get("add_up_to_symmetry") or results["add"]
-    auc = float(add["auc"]) if add else None
-    return overall(auc, float(results["particles_on_object"] or 0.0), float(results["iou"]))
+    return score_numbers(flatten(results))
+
+
+def score_numbers(numbers: Mapping[str, float], missing: float = 0.0) -> float:
+    """Return the score of numbers by their joined names (see `overall`).
+
+    Args:
+        numbers: As `flatten` returns them.
+        missing: What a detector's number that is not there counts as.
+    """
+    auc = numbers.get("add_up_to_symmetry/auc", numbers.get("add/auc"))
+    on_object, iou = (numbers.get(name, missing) for name in ("particles_on_object", "iou"))
+    return overall(auc, on_object, iou)
 
 
 def flatten(results: Mapping[str, Any], prefix: str = "") -> dict[str, float]:

@@ -29,7 +29,7 @@ from posefilter.report.image_errors import chart_errors
 from posefilter.report.page import Page
 from posefilter.report.result_tables import compare_numbers
 from posefilter.report.run_page import list_changes
-from posefilter.report.settings import compare_settings
+from posefilter.report.settings import compare_settings, read_typed
 
 LISTED = 10  # images in a table of the greatest changes
 EQUAL_MM = 0.05  # errors that differ by less are written alike
@@ -270,8 +270,3 @@ def list_settings(a: Run, b: Run, names: tuple[str, str]) -> list[Block]:
         return [Paragraph([Text(f"{note}None that is known.", "soft")])]
     said: list[Block] = [Paragraph([Text(note.strip(), "soft")])] if note else []
     return [*said, list_changes(changed, names)]
-
-
-def read_typed(overrides: Sequence[str]) -> dict[str, str]:
-    """Return typed settings by their key."""
-    return dict(one.lstrip("+~").split("=", 1) for one in overrides if "=" in one)

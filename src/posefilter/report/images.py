@@ -62,16 +62,11 @@ def sort_by_number(name: str) -> list[tuple[int, str]]:
     return [(int(part), "") if part.isdigit() else (-1, part) for part in re.split(r"(\d+)", name)]
 
 
-def split_words(name: str) -> frozenset[str]:
-    """Return the words of a name, whatever joins them."""
-    return frozenset(part for part in re.split(r"[^a-z0-9]+", name.lower()) if part)
-
-
 def group_by_section(pictures: list[StoredImage]) -> dict[str, list[StoredImage]]:
     """Return the pictures of each section, in its order; "more" holds the rest."""
     out: dict[str, list[StoredImage]] = {section: [] for section in (*SECTIONS, "more")}
     for picture in pictures:
-        own = split_words(picture.name)
+        own = {*re.split(r"[^a-z0-9]+", picture.name.lower())}  # its words, whatever joins them
         section = next((section for section, keys in SECTIONS.items() if own & keys), "more")
         out[section].append(picture)
     return out

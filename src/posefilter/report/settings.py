@@ -1,7 +1,7 @@
 """Tell in which settings a run differs from the defaults of its method."""
 
 import json
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any, NamedTuple
 
 # where and how a run was made, not what it was
@@ -40,3 +40,8 @@ def flatten_settings(config: Mapping[str, Any], prefix: str = "") -> dict[str, s
         else:
             out[name] = value if isinstance(value, str) else json.dumps(value, default=str)
     return out
+
+
+def read_typed(overrides: Iterable[str]) -> dict[str, str]:
+    """Return typed settings by their key."""
+    return dict(one.lstrip("+~").split("=", 1) for one in overrides if "=" in one)

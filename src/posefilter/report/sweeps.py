@@ -4,7 +4,7 @@ the seed as one.
 
 import csv
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -14,9 +14,10 @@ from typing import NamedTuple
 from posefilter.errors import UserError
 from posefilter.forms import MOST
 from posefilter.limits import open_text
-from posefilter.metrics.scores import overall
+from posefilter.metrics.results import score_numbers
 from posefilter.report.diagnostics import list_numbers
 from posefilter.report.gather import SWEEP_MARKS, read_json, read_part, read_texts, read_yaml
+from posefilter.report.settings import read_typed
 
 SILENT = ("out", "resume", "console", "threads")  # unless they are swept
 COLUMNS = {  # of summary.csv, and the metrics that they hold
@@ -108,7 +109,7 @@ def read_jobs(folder: Path, found: Sequence[Path]) -> tuple[list[str], list[Job]
     names = ("failed.json", "metrics_train.json", "metrics.json")
     metrics = [next((m for n in names if (m := read_json(p / n))), {}) for p in found]
     overrides = [read_texts(own, "overrides", p) for p, own in zip(found, metrics, strict=True)]
-    settings = [dict(o.lstrip("+~").split("=", 1) for o in own if "=" in o) for own in overrides]
+    settings = [read_typed(own) for own in overrides]
     keys = dict.fromkeys(key for pairs in settings for key in pairs)
     declared = read_declared(folder)
     axes = [
@@ -151,9 +152,7 @@ def read_declared(folder: Path) -> dict[str, list[Value]]:
     file = folder / "multirun.yaml"
     content = read_yaml(file)
     asked = dict(read_part(content, ("hydra", "sweeper", "params"), file))
-    for typed in read_texts(read_part(content, ("hydra", "overrides"), file), "task", file):
-        key, _, values = typed.lstrip("+~").partition("=")
-        asked[key] = values
+    asked |= read_typed(read_texts(read_part(content, ("hydra", "overrides"), file), "task", file))
     return {
         str(key): [parse_number(value.strip()) for value in str(values).split(",")]
         for key, values in asked.items()
@@ -191,19 +190,12 @@ def group_jobs(sweep: Sweep) -> list[Group]:
     return list(out.values())
 
 
-def score(numbers: Mapping[str, float]) -> float:
-    """Return what sweeps maximize (see `overall`)."""
-    least = float("-inf")
-    auc = numbers.get("add_up_to_symmetry/auc", numbers.get("add/auc"))
-    return overall(auc, numbers.get("particles_on_object", least), numbers.get("iou", least))
-
-
 def rank(jobs: Sequence[Job]) -> tuple[float, float]:
     """Return what the best of all has most of: the mean score to one decimal, then (where it ties)
     the least median ADD.
     """
     medians = [job.numbers.get("add/median_mm", math.inf) for job in jobs]
-    return round(mean(score(job.numbers) for job in jobs), 1), -mean(medians)
+    return round(mean(score_numbers(job.numbers, -math.inf) for job in jobs), 1), -mean(medians)
 
 
 def find_best_job(sweep: Sweep) -> Job:
