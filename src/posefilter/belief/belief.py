@@ -29,11 +29,11 @@ from posefilter.geometry.camera import check_camera_matrix
 from posefilter.geometry.pose import is_rigid, make_pose, origin_of
 from posefilter.geometry.pose_density import (
     PoseDensity,
+    draw_poses,
     fit_density,
     log_density,
     log_density_held_out,
 )
-from posefilter.geometry.pose_sampling import draw_poses
 from posefilter.geometry.pose_statistics import covariance_about, twist_between
 from posefilter.geometry.spaces import PoseSpace
 from posefilter.geometry.symmetries import densify, gather_copies
