@@ -30,6 +30,7 @@ from posefilter.geometry.spaces import PoseSpace
 from posefilter.protocols import Space
 from posefilter.types import Trace
 
+_COLORS = 120  # of an animation
 # colors that an animation's palette must have, however few of its pixels show them: weights, lines,
 # writing
 _KEPT = np.concatenate(
@@ -132,30 +133,28 @@ class Animation:
         return np.concatenate([self.head, middle, self.foot])
 
 
-def encode_gif(
-    frames: Sequence[np.ndarray], milliseconds: int = 220, hold: int = 1500, colors: int = 120
-) -> bytes:
+def encode_gif(frames: Sequence[np.ndarray], milliseconds: int = 220, hold: int = 1500) -> bytes:
     """Return frames as an animated GIF that loops, the one animation that TensorBoard plays; the
     last is held.
     """
-    free = colors - len(_KEPT)
+    free = _COLORS - len(_KEPT)
     # as good for choosing colors, and nine times sooner
     few = np.ascontiguousarray(frames[-1][::3, ::3])
     ground = Image.fromarray(few).quantize(free, Image.Quantize.MEDIANCUT).getpalette() or []
     own = np.reshape(ground, (-1, 3))[:free]
     palette = np.concatenate([_KEPT, own]).astype(np.uint8)
-    palette = np.pad(palette, ((0, colors - len(palette)), (0, 0)))
+    palette = np.pad(palette, ((0, _COLORS - len(palette)), (0, 0)))
     table = index_nearest_colors(palette)
     indexed = [table[(frame >> 3) @ np.array([1024, 32, 1], np.uint16)] for frame in frames]
     images = []
     for before, frame in zip([None, *indexed[:-1]], indexed, strict=True):
-        # `colors`: see-through
-        kept = frame if before is None else np.where(frame == before, np.uint8(colors), frame)
+        # `_COLORS`: see-through
+        kept = frame if before is None else np.where(frame == before, np.uint8(_COLORS), frame)
         images.append(Image.fromarray(kept, "P"))
         images[-1].putpalette(palette.tobytes())
     durations = [milliseconds] * (len(frames) - 1) + [hold]
     stream = BytesIO()
-    save: dict[str, Any] = {"loop": 0, "transparency": colors, "disposal": 1, "optimize": False}
+    save: dict[str, Any] = {"loop": 0, "transparency": _COLORS, "disposal": 1, "optimize": False}
     images[0].save(
         stream, "GIF", save_all=True, append_images=images[1:], duration=durations, **save
     )
