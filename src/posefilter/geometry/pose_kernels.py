@@ -79,10 +79,7 @@ def measure_neighbors(
                 own, share = own.gather(1, near[..., None].expand(-1, -1, 6)), weights[near]
             share = (share / share.sum(1, keepdim=True))[..., None]
             own = own - (share * own).sum(1, keepdim=True)
-            covariance = (share * own).mT @ own
-            size = covariance.diagonal(dim1=1, dim2=2).mean(1)[:, None, None]
-            blunt = _ISOTROPIC * size * torch.eye(6).to(covariance)
-            found[number].append((1 - _ISOTROPIC) * covariance + blunt)
+            found[number].append(_blunt((share * own).mT @ own))
     return [torch.cat(one) for one in found]
 
 
@@ -110,10 +107,14 @@ def measure_modes(parts: TwistParts, weights: Tensor, member: Tensor, unit: Tens
         counts.append(float(1 / share.square().sum()) - 1)
     each, effective = torch.stack(found), weights.new_tensor(counts)[:, None, None]
     common = (effective * each).sum(0) / effective.sum().clamp_min(1e-9)
-    covariance = (effective * each + _SHRINK * common) / (effective + _SHRINK)
+    return _blunt((effective * each + _SHRINK * common) / (effective + _SHRINK))[member]
+
+
+def _blunt(covariance: Tensor) -> Tensor:
+    """Return covariances (N, 6, 6) of which a share has no direction, of the same mean variance."""
     size = covariance.diagonal(dim1=1, dim2=2).mean(1)[:, None, None]
-    blunt = _ISOTROPIC * size * torch.eye(6).to(covariance)
-    return ((1 - _ISOTROPIC) * covariance + blunt)[member]
+    even = _ISOTROPIC * size * torch.eye(6).to(covariance)
+    return (1 - _ISOTROPIC) * covariance + even
 
 
 def whiten_kernels(covariance: Tensor) -> tuple[Tensor, Tensor]:

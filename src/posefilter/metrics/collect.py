@@ -94,6 +94,11 @@ def summarize_errors(rows: Tensor, models: Sequence[ObjectModel]) -> dict[str, d
     return blocks
 
 
+def lies_within(visible: Tensor, low: float, high: float) -> Tensor:
+    """Tell which visible shares (N,) lie in a range: its lower end does, its upper only at 1."""
+    return (visible >= low) & ((visible < high) if high < 1 else (visible <= 1))
+
+
 class ErrorsByVisibility(Rows):
     """ADD and ADD-S of the instances in each range of visibility: means over all images hide the
     effect of occlusion. Unknown visibility is in none.
@@ -125,7 +130,7 @@ class ErrorsByVisibility(Rows):
         visible = rows[:, 4]
         out = {}
         for low, high in self.ranges:
-            selected = (visible >= low) & ((visible < high) if high < 1 else (visible <= 1))
+            selected = lies_within(visible, low, high)
             if bool(selected.any()):
                 blocks = summarize_errors(rows[selected, :4], self.models)
                 out[f"{low:g}-{high:g}"] = {"instances": int(selected.sum()), **blocks}
