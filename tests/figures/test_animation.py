@@ -8,9 +8,8 @@ import numpy as np
 import torch
 from PIL import Image
 
-from posefilter.figures.animation import Animation
+from posefilter.figures.animation import Animation, encode_gif
 from posefilter.figures.canvas import TRUTH, full_view
-from posefilter.figures.gif import encode_gif
 from posefilter.figures.layout import WIDTH
 from posefilter.figures.particles import color_by_weight, draw_iterations
 from posefilter.figures.silhouettes import (

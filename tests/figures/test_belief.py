@@ -10,13 +10,14 @@ import torch
 from posefilter.belief import Belief
 from posefilter.figures.belief import (
     Mark,
+    describe_belief,
     draw_belief,
     draw_rotations,
     find_longest_axis,
     scale_radii,
     select_single,
+    summarize_belief,
 )
-from posefilter.figures.belief_summary import describe_belief, summarize_belief
 from posefilter.figures.canvas import halve
 from posefilter.figures.layout import WIDTH
 from posefilter.figures.marginals import compute_marginals

@@ -10,8 +10,13 @@ from torch import Generator, Tensor
 from posefilter.errors import UserError
 from posefilter.filters.importance import ImportanceSampling
 from posefilter.geometry.pose import make_pose, move_about
-from posefilter.geometry.pose_density import fit_density, log_density
-from posefilter.geometry.pose_sampling import draw_poses, measure_kernels, widen
+from posefilter.geometry.pose_density import (
+    draw_poses,
+    fit_density,
+    log_density,
+    measure_kernels,
+    widen,
+)
 from posefilter.geometry.pose_statistics import covariance_about, twist_between
 from posefilter.geometry.rotation import exp_so3, random_rotation
 from posefilter.geometry.spaces import PoseSpace

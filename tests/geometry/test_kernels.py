@@ -7,10 +7,13 @@ import torch
 
 from posefilter.geometry.camera import intrinsics, project
 from posefilter.geometry.pose import make_pose, move_about
-from posefilter.geometry.pose_density import fit_density, log_density
-from posefilter.geometry.pose_kernels import measure_modes, measure_neighbors, whiten_kernels
-from posefilter.geometry.pose_sampling import draw_poses
-from posefilter.geometry.pose_twists import split_poses
+from posefilter.geometry.pose_density import draw_poses, fit_density, log_density
+from posefilter.geometry.pose_kernels import (
+    measure_modes,
+    measure_neighbors,
+    split_poses,
+    whiten_kernels,
+)
 from posefilter.geometry.rotation import exp_so3
 
 CENTER = torch.tensor([0.02, 0.0, -0.01]).double()

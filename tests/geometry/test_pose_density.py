@@ -15,8 +15,8 @@ from posefilter.geometry.pose_density import (
     log_density,
     log_density_held_out,
 )
+from posefilter.geometry.pose_kernels import pair_twists, split_poses
 from posefilter.geometry.pose_statistics import twist_between
-from posefilter.geometry.pose_twists import pair_twists, split_poses
 from posefilter.geometry.rotation import exp_so3, random_rotation
 
 CENTER = torch.tensor([0.02, -0.01, 0.1]).double()

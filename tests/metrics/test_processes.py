@@ -15,12 +15,17 @@ from torchmetrics import Metric
 
 from posefilter.geometry.pose import make_pose
 from posefilter.metrics.bop import BopErrors
-from posefilter.metrics.collect import BeliefQuality, BoxIoU, ParticlesOnObject, PoseErrors
+from posefilter.metrics.collect import (
+    BeliefQuality,
+    BoxIoU,
+    ErrorsByVisibility,
+    ParticlesOnObject,
+    PoseErrors,
+)
 from posefilter.metrics.confidence import Confidence
 from posefilter.metrics.credibility import Credibility, TruthScores
 from posefilter.metrics.diagnostics import FilterDiagnostics
 from posefilter.metrics.parts import PartIoU
-from posefilter.metrics.visibility import ErrorsByVisibility
 from posefilter.types import BeliefBatch, ParticleOutput, Particles, Step, Trace
 
 MODEL = square()

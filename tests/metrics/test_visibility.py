@@ -4,8 +4,7 @@ import torch
 from tests.models.toy import square
 
 from posefilter.geometry.pose import make_pose
-from posefilter.metrics.collect import PoseErrors
-from posefilter.metrics.visibility import ErrorsByVisibility
+from posefilter.metrics.collect import ErrorsByVisibility, PoseErrors
 
 
 def measure(poses: torch.Tensor, truth: torch.Tensor) -> torch.Tensor:

@@ -19,9 +19,9 @@ import posefilter
 from posefilter.errors import UserError
 from posefilter.estimator import Estimator
 from posefilter.images import Images
-from posefilter.tracking.frame import Frame
 from posefilter.tracking.processes import WorkerProcess, share_out
 from posefilter.tracking.settings import TrackerSettings
+from posefilter.tracking.window import Frame
 from posefilter.tracking.worker import Start
 from posefilter.types import Batch
 

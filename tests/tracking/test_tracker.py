@@ -20,9 +20,9 @@ from posefilter.filters.icp import PointToPlaneIcp
 from posefilter.filters.refine import Compose
 from posefilter.filters.texture import TextureRotations
 from posefilter.geometry.rotation import random_rotation
+from posefilter.tracking.components import RotateTogether
 from posefilter.tracking.motion import ConstantVelocity
 from posefilter.tracking.objectness import measure_objectness
-from posefilter.tracking.rotate import RotateTogether
 from posefilter.tracking.settings import FilterSettings, TrackerSettings
 from posefilter.tracking.track_loss import TrackLossDetector
 from posefilter.types import Batch, BeliefBatch

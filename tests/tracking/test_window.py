@@ -5,8 +5,7 @@ import pytest
 import torch
 
 from posefilter.images import Images
-from posefilter.tracking.frame import Frame
-from posefilter.tracking.window import place_window
+from posefilter.tracking.window import Frame, place_window
 from posefilter.types import ObjectModel
 
 K = np.array([[1000.0, 0, 640], [0, 1000, 480], [0, 0, 1]])

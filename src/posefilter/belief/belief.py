@@ -29,11 +29,11 @@ from posefilter.geometry.camera import check_camera_matrix
 from posefilter.geometry.pose import is_rigid, make_pose, origin_of
 from posefilter.geometry.pose_density import (
     PoseDensity,
+    draw_poses,
     fit_density,
     log_density,
     log_density_held_out,
 )
-from posefilter.geometry.pose_sampling import draw_poses
 from posefilter.geometry.pose_statistics import covariance_about, twist_between
 from posefilter.geometry.spaces import PoseSpace
 from posefilter.geometry.symmetries import densify, gather_copies
@@ -122,7 +122,7 @@ class Belief:
 
         Between two modes it is a pose that no particle holds; see `modes`.
         """
-        return self._mean(*self._tensors).numpy()
+        return self._space.mean(*self._tensors).numpy()
 
     @cached_property
     def covariance(self) -> np.ndarray:
@@ -190,7 +190,7 @@ class Belief:
                 break
             own = found.member == number
             poses, share = samples[own], weights[own] / weights[own].sum()
-            spread = covariance_about(self._mean(poses, share), poses, share, center)
+            spread = covariance_about(self._space.mean(poses, share), poses, share, center)
             same = next((i for i in range(number) if self._is_equivalent(found, i, pose)), None)
             modes.append(Mode(pose.numpy(), float(mass), spread.numpy(), same))
         return tuple(modes)
@@ -309,7 +309,7 @@ class Belief:
         if not self.draws:
             heaviest = self._found.member == 0
             own = torch.isin(self._found.member, torch.tensor(self._list_alike()))
-        pose = self._mean(samples[heaviest], weights[heaviest] / weights[heaviest].sum())
+        pose = self._space.mean(samples[heaviest], weights[heaviest] / weights[heaviest].sum())
         poses, share = samples[own], weights[own] / weights[own].sum()
         mass, group = float(weights[own].sum()), densify(torch.from_numpy(self.symmetries))
         return measure_uncertainty(poses, share, pose, mass, center, group, level)
@@ -463,7 +463,7 @@ class Belief:
         if not draws:
             return find_pose_modes(samples, weights.log(), self._space, self.diameter)
         mass = weights[:draws].sum()
-        states = self._mean(samples[:draws], weights[:draws] / mass)[None]
+        states = self._space.mean(samples[:draws], weights[:draws] / mass)[None]
         masses, member = mass[None], torch.zeros(len(weights), dtype=torch.int64)
         if float(others.sum()) > 0:
             share = (others / others.sum()).log()
@@ -489,9 +489,6 @@ class Belief:
     @property
     def _space(self) -> PoseSpace:
         return PoseSpace(tuple(self.center.tolist()), self.radius)
-
-    def _mean(self, samples: Tensor, weights: Tensor) -> Tensor:
-        return self._space.mean(samples, weights)
 
 
 def _as_numbers(name: str, value: Any) -> np.ndarray:

@@ -13,10 +13,9 @@ from posefilter.callbacks.drawings import animate
 from posefilter.callbacks.gallery import name_frame, select_image
 from posefilter.callbacks.tensorboard import Budget, log_numbers, post_image
 from posefilter.callbacks.trace_callback import TraceCallback
-from posefilter.callbacks.trajectories import trace_lineage
 from posefilter.figures.canvas import AXES, Color, to_image
 from posefilter.figures.curves import draw_shares
-from posefilter.figures.trajectories import draw_trajectories
+from posefilter.figures.trajectories import draw_trajectories, trace_lineage
 from posefilter.metrics.diagnostics import FilterDiagnostics
 from posefilter.metrics.registry import find_metric
 from posefilter.models.base import PoseEstimator

@@ -20,17 +20,21 @@ from posefilter.callbacks.fields import (
     predict_proposals,
 )
 from posefilter.callbacks.gallery import KeptImage, draw_gallery
-from posefilter.callbacks.trajectories import extract_glimpses, follow_particles, trace_lineage
 from posefilter.capabilities import Capability
-from posefilter.figures.animation import Animation
+from posefilter.figures.animation import Animation, encode_gif
 from posefilter.figures.belief import draw_belief
 from posefilter.figures.field import draw_point_field, draw_pose_field
-from posefilter.figures.gif import encode_gif
 from posefilter.figures.maps import draw_objectness, draw_proposals
 from posefilter.figures.overlay import Shape, trace_outline
 from posefilter.figures.particles import draw_iterations, normalize_weights
 from posefilter.figures.silhouettes import draw_silhouettes, outline_hulls, project_hulls
-from posefilter.figures.trajectories import draw_glimpses, draw_trajectories
+from posefilter.figures.trajectories import (
+    draw_glimpses,
+    draw_trajectories,
+    extract_glimpses,
+    follow_particles,
+    trace_lineage,
+)
 from posefilter.geometry.spaces import PoseSpace
 from posefilter.models.base import PoseEstimator
 from posefilter.protocols import HasImagePatches, ProposesPoses, ScoresPoses

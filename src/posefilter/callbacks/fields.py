@@ -34,6 +34,10 @@ from posefilter.protocols import Encoding, ProposesPoses, ScoresPoses
 from posefilter.types import Batch, ObjectModel, Step
 
 _FINE = (2.0, 4.0, 8.0)  # [degrees] beside every fifteenth degree: sharp peaks are narrow
+_LEVELS = 3  # of noise, at most
+_PIXELS = 48  # image points of a pose
+_CELLS = 31  # of a side of a slice of points
+_DRAWN = 24  # poses of the proposal network
 
 
 @runtime_checkable
@@ -45,12 +49,12 @@ class ScoresPoints(Protocol):
         ...
 
 
-def choose_levels(steps: Sequence[Step], max_levels: int = 3) -> tuple[float, ...]:
+def choose_levels(steps: Sequence[Step]) -> tuple[float, ...]:
     """Return noise levels that a filter ran through, broad to sharp: the ends and what lies evenly
     between them.
     """
     found = sorted({float(step.sigma.reshape(-1)[0]) for step in steps}, reverse=True)
-    return tuple(found[i] for i in choose_steps(len(found), max_levels))
+    return tuple(found[i] for i in choose_steps(len(found), _LEVELS))
 
 
 def evaluate_pose_field(
@@ -59,15 +63,14 @@ def evaluate_pose_field(
     truth: Tensor,
     object_model: ObjectModel,
     sigmas: Sequence[float],
-    pixels: int = 48,
     cells: int = 9,
 ) -> PoseField:
     """Score slices through the truth of one image, at each noise level, with the same image points
     at all of them.
 
-    truth (4, 4) camera_from_object [m]; pixels: image points a pose; cells: a side of a slice, odd
-    so that the truth is its middle. Slices go as far as six noise levels, at least a quarter of the
-    object's radius and at most twice it.
+    truth (4, 4) camera_from_object [m]; cells: a side of a slice, odd so that the truth is its
+    middle. Slices go as far as six noise levels, at least a quarter of the object's radius and at
+    most twice it.
     """
     center = object_model.center.to(truth)
     degrees = torch.tensor(
@@ -83,7 +86,7 @@ def evaluate_pose_field(
         generator = torch.Generator(device=truth.device).manual_seed(0)
         # as the filter reads
         with torch.autocast(truth.device.type, torch.bfloat16, enabled=fast_bfloat16(truth.device)):
-            found = method.score_poses(encoding, poses, sigma, generator, pixels)
+            found = method.score_poses(encoding, poses, sigma, generator, _PIXELS)
         score = found[0].float().cpu()
         less = (score - score[0])[1:].numpy()
         planes.append(less[: 3 * cells * cells].reshape(3, cells, cells))
@@ -122,7 +125,6 @@ def evaluate_point_field(
     on: bool,
     sigmas: Sequence[float],
     depthwise: bool = False,
-    cells: int = 31,
 ) -> PointField:
     """Judge one pixel of one image at places in the object's frame, its color and ray as they are.
 
@@ -134,8 +136,8 @@ def evaluate_point_field(
     order = points.ray[0, 0, 0].abs().argsort().tolist()  # the axis most along the ray comes last
     plane = (min(order[1:]), max(order[1:])) if depthwise else (min(order[:2]), max(order[:2]))
     extent = 1.3 * object_model.radius
-    line = torch.linspace(-extent, extent, cells, dtype=truth.dtype, device=truth.device)
-    places = place.expand(cells, cells, 3).clone()
+    line = torch.linspace(-extent, extent, _CELLS, dtype=truth.dtype, device=truth.device)
+    places = place.expand(_CELLS, _CELLS, 3).clone()
     places[..., plane[0]], places[..., plane[1]] = line[None, :], line[:, None]
     asked = torch.cat([place[None], places.flatten(0, 1)])
     alike = lambda x: x.expand(1, 1, len(asked), *x.shape[3:])  # noqa: E731
@@ -149,7 +151,7 @@ def evaluate_point_field(
         many = many._replace(context=query(image.context, u, v, many.position / radius))
     judged = [likelihood.score_points(many, sigma, center, radius)[0, 0] for sigma in sigmas]
     found = torch.stack([one.float().cpu() for one in judged]).numpy()
-    scores = found[:, 1:].reshape(len(sigmas), cells, cells)
+    scores = found[:, 1:].reshape(len(sigmas), _CELLS, _CELLS)
     return PointField(
         pixel, on, place.cpu().numpy(), plane, extent, tuple(sigmas), scores, found[:, 0]
     )
@@ -194,18 +196,14 @@ def choose_pixels(batch: Batch, object_model: ObjectModel) -> list[tuple[tuple[i
 
 
 def predict_proposals(
-    method: ProposesPoses,
-    encoding: HasCoordinates,
-    batch: Batch,
-    object_model: ObjectModel,
-    drawn: int = 24,
+    method: ProposesPoses, encoding: HasCoordinates, batch: Batch, object_model: ObjectModel
 ) -> Proposals | None:
     """Return what the proposal network makes of one image; None where no depth is known."""
     if not bool(encoding.cells.valid.any()):
         return None
     center = object_model.center.to(batch.depth)
     generator = torch.Generator(device=batch.depth.device).manual_seed(0)
-    poses = method.propose_poses(encoding, drawn, generator)[0].cpu().double()
+    poses = method.propose_poses(encoding, _DRAWN, generator)[0].cpu().double()
     middle, K = object_model.center.cpu().double(), batch.intrinsics[0].cpu().double()
     axes = project_axes(poses, middle, 0.5 * object_model.radius, K)
     truth, _, usable = true_coordinates(

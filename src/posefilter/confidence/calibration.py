@@ -12,7 +12,7 @@ tolerance when it is asked for.
 """
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields, replace
 from functools import lru_cache
 from typing import Any, NamedTuple
@@ -264,6 +264,11 @@ def _read(content: Any) -> Calibration:
     if not all(isinstance(key, str) and _NAME.fullmatch(key) for key in quality):
         raise ValueError("has a quality without a name")
     numbers = _numbers(list(quality.values()), len(quality), "quality")
+
+    def read(name: str, reader: Callable[..., Any], *more: Any) -> Any:
+        """Return a part that may be missing, which is then None."""
+        return None if content.get(name) is None else reader(content[name], *more)
+
     return Calibration(
         tuple(features),
         _numbers(content["center"], count, "center"),
@@ -273,10 +278,10 @@ def _read(content: Any) -> Calibration:
         dict(counts),
         source,
         dict(zip(quality, numbers, strict=True)),
-        _conformal(content.get("conformal")),
-        None if content.get("choice") is None else _logistic(content["choice"], count, "choice"),
-        _errors(content.get("errors"), count),
-        _belief_scale(content.get("belief_scale"), count),
+        read("conformal", _conformal),
+        read("choice", _logistic, count, "choice"),
+        read("errors", _errors, count),
+        read("belief_scale", _belief_scale, count),
     )
 
 
@@ -287,9 +292,7 @@ def _logistic(content: Any, count: int, name: str) -> Logistic:
     return Logistic(weights, _numbers([content["bias"]], 1, f"{name}'s bias")[0])
 
 
-def _belief_scale(content: Any, count: int) -> BeliefScale | None:
-    if content is None:
-        return None
+def _belief_scale(content: Any, count: int) -> BeliefScale:
     # earlier versions have no weights, and the usual degrees of freedom
     later = {"weights", "degrees"}
     if not isinstance(content, dict) or set(content) - later != {"bias", "slope"}:
@@ -307,9 +310,7 @@ def _belief_scale(content: Any, count: int) -> BeliefScale | None:
     return BeliefScale(numbers[0], numbers[1], numbers[2:], degrees)
 
 
-def _errors(content: Any, count: int) -> CalibrationErrors | None:
-    if content is None:
-        return None
+def _errors(content: Any, count: int) -> CalibrationErrors:
     width = count + len(PoseErrors._fields)
     is_table = isinstance(content, Tensor) and content.dtype == torch.float16
     if not is_table or content.dim() != 2 or content.shape[1] != width:
@@ -323,9 +324,7 @@ def _errors(content: Any, count: int) -> CalibrationErrors | None:
     return tabulate_errors(features.numpy(), errors.numpy())
 
 
-def _conformal(content: Any) -> Conformal | None:
-    if content is None:
-        return None
+def _conformal(content: Any) -> Conformal:
     if isinstance(content, dict) and "surprises" in content:  # the name in earlier versions
         content = {"scores" if key == "surprises" else key: x for key, x in content.items()}
     if not isinstance(content, dict) or set(content) - {"by"} != {"edges", "scores"}:

@@ -87,7 +87,8 @@ def _of_camera(content: Mapping[str, Any], K: np.ndarray, path: Path) -> CameraF
     if distortion is None:
         coefficients = _find_named(content, path)
     else:
-        coefficients = _flat(distortion["data"], path)
+        count = np.asarray(distortion["data"], dtype=object).size
+        coefficients = tuple(numbers(distortion, "data", path, (count,)).tolist())
     projection = _listed(content, _PROJECTIONS)
     P = None if projection is None else numbers(projection, "data", path, (3, 4))
     rectified = None if P is None or P[0, 0] <= 0 else P[:, :3]
@@ -134,11 +135,6 @@ def _listed(content: Mapping[str, Any], keys: tuple[str, ...]) -> dict[str, Any]
         if isinstance(value, list):
             return {"data": value}
     return None
-
-
-def _flat(value: Any, path: Path) -> tuple[float, ...]:
-    count = np.asarray(value, dtype=object).size
-    return tuple(numbers({"data": value}, "data", path, (count,)).tolist())
 
 
 def _matrix(fx: float, fy: float, cx: float, cy: float, path: Path) -> np.ndarray:

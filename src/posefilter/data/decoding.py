@@ -25,6 +25,8 @@ class FrameDecoder:
         width: Of the network's images [px]; None: by the height, or as stored.
         height: Likewise.
         cache: Opens the cache, given `read`.
+        threads: That decode.
+        progress: Draw bars.
 
     Raises:
         UserError: Two records cannot be told apart.
@@ -37,8 +39,11 @@ class FrameDecoder:
         width: int | None,
         height: int | None,
         cache: Callable[[Callable[[FrameRecord], Sample]], FrameCache],
+        threads: int,
+        progress: bool,
     ) -> None:
         self._reader, self._size = reader, (width, height)
+        self._threads, self._progress = threads, progress
         self.cache = cache(self.read)
         self._index = index_records(reader, records)
 
@@ -66,9 +71,7 @@ class FrameDecoder:
         min_visibility: float,
         limit: int | None,
         on_error: str,
-        threads: int,
         title: str,
-        progress: bool,
     ) -> tuple[list[FrameRecord], Counter[str]]:
         """Return the records that can be used, and how many were left out for which reason.
 
@@ -79,7 +82,7 @@ class FrameDecoder:
         """
         chosen: list[FrameRecord] = []
         left_out: Counter[str] = Counter()
-        for record, found in self._fetch_all(records, threads, title, progress):
+        for record, found in self._fetch_all(records, title):
             if limit is not None and len(chosen) >= limit:
                 break
             if isinstance(found, BadData):
@@ -99,11 +102,11 @@ class FrameDecoder:
         return chosen, left_out
 
     def _fetch_all(
-        self, records: Sequence[FrameRecord], threads: int, title: str, progress: bool
+        self, records: Sequence[FrameRecord], title: str
     ) -> Iterator[tuple[FrameRecord, Prepared | BadData]]:
         """Yield the records in order, each with what is kept of it, or what is wrong with it."""
-        shown = progress and len(records) >= _CHUNK
-        with ThreadPoolExecutor(threads) as pool, bars(shown=shown, transient=True) as bar:
+        shown = self._progress and len(records) >= _CHUNK
+        with ThreadPoolExecutor(self._threads) as pool, bars(shown=shown, transient=True) as bar:
             task = bar.add_task(title, total=len(records))
             for at in range(0, len(records), _CHUNK):
                 chunk = records[at : at + _CHUNK]

@@ -12,7 +12,7 @@ from lightning import LightningDataModule
 from torch.utils.data import DataLoader
 
 from posefilter.data.absent import find_absent
-from posefilter.data.cache import CACHES, open_cache
+from posefilter.data.cache import CACHES, FrameCache, open_cache
 from posefilter.data.dataset import EpochShuffle, FrameDataset
 from posefilter.data.decoding import FrameDecoder
 from posefilter.data.frames import FrameRecord
@@ -180,7 +180,13 @@ class PoseDataModule(LightningDataModule):
         )
         folder = Path(self._cache_dir or self.root / ".cache")
         cache = partial(open_cache, self._cache_kind, folder, f"1 {content}")
-        return FrameDecoder(self.reader, self._records, *size, cache)
+        return self._make_decoder(self.reader, self._records, cache)
+
+    def _make_decoder(
+        self, reader: BaseReader, records: Sequence[FrameRecord], cache: Callable[..., FrameCache]
+    ) -> FrameDecoder:
+        size = self._image_width, self._image_height
+        return FrameDecoder(reader, records, *size, cache, max(self._workers, 2), self._progress)
 
     def prepare_data(self) -> None:
         """Render the scenes if the source is `scenes` and they do not exist yet."""
@@ -266,17 +272,9 @@ class PoseDataModule(LightningDataModule):
         found = find_absent(records, self._records, scenes, split, self.objects[0])
         order = np.random.default_rng([self._split_seed, 11]).permutation(len(found))
         keep = partial(open_cache, "memory", Path(), "")
-        size = (self._image_width, self._image_height)
-        decoder = FrameDecoder(reader, records, *size, keep)
-        chosen, _ = decoder.find_usable(
-            [found[i] for i in order],
-            0.0,
-            limit,
-            "skip",
-            max(self._workers, 2),
-            "decoding frames without the object",
-            self._progress,
-        )
+        decoder = self._make_decoder(reader, records, keep)
+        title = "decoding frames without the object"
+        chosen, _ = decoder.find_usable([found[i] for i in order], 0.0, limit, "skip", title)
         return FrameDataset(chosen, decoder.cache)
 
     def train_dataloader(self) -> DataLoader[Batch]:
@@ -377,13 +375,7 @@ class PoseDataModule(LightningDataModule):
             part = [part[i] for i in order]
         records = [self._records[i] for i in part]
         chosen, self._left_out[split] = self._decoder.find_usable(
-            records,
-            self._least[split],
-            limit,
-            self._on_error,
-            max(self._workers, 2),
-            f"decoding {split} frames",
-            self._progress,
+            records, self._least[split], limit, self._on_error, f"decoding {split} frames"
         )
         if part and not chosen and limit != 0:
             raise UserError(

@@ -6,7 +6,7 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -42,10 +42,11 @@ class Video(ABC):
     objects: tuple[str, ...] | None  # that are known to be in it; None: that is not known
     ids: dict[str, int]  # their numbers in the dataset
     several: tuple[str, ...] = ()  # objects that a frame shows more than once
+    _frames: Sequence[Any]  # what reading each takes
 
-    @abstractmethod
     def __len__(self) -> int:
         """Return the number of frames."""
+        return len(self._frames)
 
     @abstractmethod
     def read(self, index: int) -> VideoFrame | None:
@@ -128,10 +129,6 @@ class FolderVideo(Video):
         places = numbers or range(len(color))
         self._frames = [*zip(places, color, depth, strict=True)][::stride]
 
-    def __len__(self) -> int:
-        """Return the number of frames."""
-        return len(self._frames)
-
     def read(self, index: int) -> VideoFrame:
         """Return a frame."""
         number, color, depth = self._frames[index]
@@ -182,10 +179,6 @@ class SceneVideo(Video):
         self.ids = {record.object: record.obj_id for record in own}
         counts = Counter((record.im_id, record.object) for record in own)
         self.several = tuple(sorted({name for (_, name), count in counts.items() if count > 1}))
-
-    def __len__(self) -> int:
-        """Return the number of frames."""
-        return len(self._frames)
 
     def read(self, index: int) -> VideoFrame | None:
         """Return a frame; None where nothing of it is labeled, so that no reader opens it."""

@@ -178,17 +178,16 @@ def _counts(many: int, fractions: Mapping[str, float]) -> dict[str, int]:
 
 def _named(records: Sequence[FrameRecord], patterns: list[str], part: str) -> list[int]:
     scenes = {record.group for record in records}
+    chosen = set[str]()
     for pattern in patterns:
-        if not fnmatch.filter(scenes, str(pattern)):
+        found = fnmatch.filter(scenes, str(pattern))
+        if not found:
             some = ", ".join(sorted(scenes)[:6])
             raise UserError(
                 f"data.split.{part}: no scene '{pattern}'; there are {len(scenes)}: {some}, ..."
             )
-    return [
-        i
-        for i, record in enumerate(records)
-        if any(fnmatch.fnmatch(record.group, str(p)) for p in patterns)
-    ]
+        chosen.update(found)
+    return [i for i, record in enumerate(records) if record.group in chosen]
 
 
 def _listed(records: Sequence[FrameRecord], file: str, root: Path) -> list[int]:

@@ -1,13 +1,17 @@
 """An animation of the filter at work, and silhouettes of its particles: poses or pixels, from one
-iteration to the next.
+iteration to the next; and its encoding as a GIF.
 """
 
 from collections.abc import Iterator, Sequence
+from io import BytesIO
+from typing import Any
 
 import numpy as np
 import torch
+from matplotlib import colormaps
+from PIL import Image
 
-from posefilter.figures.canvas import TRUTH, close_up, full_view, stamp_dots
+from posefilter.figures.canvas import INK, PAPER, TRUTH, close_up, full_view, stamp_dots
 from posefilter.figures.layout import WIDTH, add_caption, center_part, compose_figure, draw_legend
 from posefilter.figures.panels import arrange_row
 from posefilter.figures.particles import (
@@ -25,6 +29,16 @@ from posefilter.geometry.pose import origin_of
 from posefilter.geometry.spaces import PoseSpace
 from posefilter.protocols import Space
 from posefilter.types import Trace
+
+_COLORS = 120  # of an animation
+# colors that an animation's palette must have, however few of its pixels show them: weights, lines,
+# writing
+_KEPT = np.concatenate(
+    [
+        colormaps["plasma"](np.linspace(0, 1, 20))[:, :3] * 255,
+        [TRUTH, _LINE, INK, PAPER, (150, 152, 156)],
+    ]
+)
 
 
 class Animation:
@@ -117,3 +131,43 @@ class Animation:
             parts.append(picture)
         middle = add_caption(center_part(arrange_row(parts)), caption)
         return np.concatenate([self.head, middle, self.foot])
+
+
+def encode_gif(frames: Sequence[np.ndarray], milliseconds: int = 220, hold: int = 1500) -> bytes:
+    """Return frames as an animated GIF that loops, the one animation that TensorBoard plays; the
+    last is held.
+    """
+    free = _COLORS - len(_KEPT)
+    # as good for choosing colors, and nine times sooner
+    few = np.ascontiguousarray(frames[-1][::3, ::3])
+    ground = Image.fromarray(few).quantize(free, Image.Quantize.MEDIANCUT).getpalette() or []
+    own = np.reshape(ground, (-1, 3))[:free]
+    palette = np.concatenate([_KEPT, own]).astype(np.uint8)
+    palette = np.pad(palette, ((0, _COLORS - len(palette)), (0, 0)))
+    table = index_nearest_colors(palette)
+    indexed = [table[(frame >> 3) @ np.array([1024, 32, 1], np.uint16)] for frame in frames]
+    images = []
+    for before, frame in zip([None, *indexed[:-1]], indexed, strict=True):
+        # `_COLORS`: see-through
+        kept = frame if before is None else np.where(frame == before, np.uint8(_COLORS), frame)
+        images.append(Image.fromarray(kept, "P"))
+        images[-1].putpalette(palette.tobytes())
+    durations = [milliseconds] * (len(frames) - 1) + [hold]
+    stream = BytesIO()
+    save: dict[str, Any] = {"loop": 0, "transparency": _COLORS, "disposal": 1, "optimize": False}
+    images[0].save(
+        stream, "GIF", save_all=True, append_images=images[1:], duration=durations, **save
+    )
+    return stream.getvalue()
+
+
+def index_nearest_colors(palette: np.ndarray) -> np.ndarray:
+    """Return which of at most 255 colors (P, 3) is nearest to each color of 5 bits a channel.  ->
+    (32^3,) uint8.
+    """
+    line = np.arange(32, dtype=np.float32) * 8 + 4
+    places = np.stack(np.meshgrid(line, line, line, indexing="ij"), -1).reshape(-1, 3)
+    own = palette.astype(np.float32)
+    # less the place's own square, which is the same for all
+    far = (own * own).sum(1) - 2 * places @ own.T
+    return far.argmin(1).astype(np.uint8)

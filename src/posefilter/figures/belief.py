@@ -4,8 +4,11 @@ marginals of each axis.
 The map follows Murphy et al. 2021 (Implicit-PDF, figure 3): a rotation is a point where one of the
 object's axes points, and a color for the rotation about that axis. Ours looks along the camera: the
 center is towards it, right and up are the image's.
+
+Above it is said in words how sure the belief is, and which other pose it holds for possible.
 """
 
+import math
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -13,7 +16,6 @@ import numpy as np
 import torch
 
 from posefilter.belief import Belief
-from posefilter.figures.belief_summary import describe_belief, summarize_belief
 from posefilter.figures.canvas import Color, View, arrange_grid, draw_dots, halve
 from posefilter.figures.layout import (
     CAPTION,
@@ -21,6 +23,7 @@ from posefilter.figures.layout import (
     compose_figure,
     draw_legend,
     draw_text,
+    format_length,
     tile_width,
 )
 from posefilter.figures.marginals import ESTIMATE, OBJECT_AXES, TRUTH, draw_marginals
@@ -34,9 +37,13 @@ from posefilter.figures.mollweide import (
 )
 from posefilter.figures.panels import arrange_row, draw_mark
 from posefilter.figures.particles import color_by_weight, draw_weight_scale, fade
+from posefilter.figures.view_data import Hypothesis, find_hypotheses
 from posefilter.geometry.camera import project
 from posefilter.geometry.pose import origin_of, rotation_of
+from posefilter.geometry.rotation import angle_between
+from posefilter.geometry.spaces import PoseSpace
 from posefilter.images import to_camera, to_picture, to_pose
+from posefilter.metrics.beliefs import spread
 from posefilter.types import BeliefBatch, ObjectModel
 
 _SECOND: Color = (226, 110, 0)
@@ -209,3 +216,60 @@ def choose_window(
     u = float(np.clip(middle[0], min(reach, width / 2), max(width - reach, width / 2)))
     v = float(np.clip(middle[1], min(reach, height / 2), max(height - reach, height / 2)))
     return u - reach, v - reach, u + reach
+
+
+class BeliefSummary(NamedTuple):
+    """How sure a belief about one image is."""
+
+    translation: float  # root mean square distance of the estimate's mode's centers from their mean
+    rotation: float  # the same of the rotations [rad]
+    share: float  # weight of the estimate's mode, 0 where the estimate belongs to none
+    second: Hypothesis | None  # the heaviest of the other modes, if one counts
+    second_translation: float  # how far its center is from the estimate's [m]
+    second_rotation: float  # by how much it is turned from the estimate [rad]
+
+
+def summarize_belief(
+    poses: torch.Tensor,
+    weights: torch.Tensor,
+    best: torch.Tensor,
+    object_model: ObjectModel,
+    draws: int = 0,
+) -> BeliefSummary:
+    """Return how sure a belief is; poses that a symmetry makes of one another are one.
+
+    Args:
+        poses: Particles (N, 4, 4), camera_from_object [m], float64.
+        weights: Their weights (N,), summing to 1.
+        best: The estimate (4, 4).
+        object_model: The object.
+        draws: So many of the first particles are a calibrated belief's draws about the estimate.
+    """
+    center = object_model.center.detach().cpu().double()
+    found = find_hypotheses(poses, weights.log(), best, object_model, draws)
+    space = PoseSpace((*center.tolist(),), object_model.radius)
+    members = found.own if bool(found.own.any()) else torch.ones_like(found.own)
+    own = torch.where(members, weights, 0.0)
+    translation, rotation = spread(found.poses[None], (own / own.sum()).log()[None], space)
+    second = found.others[0] if found.others else None
+    away = turned = 0.0
+    if second is not None:
+        other = torch.from_numpy(second.pose).to(best)
+        away = float((origin_of(other, center) - origin_of(best, center)).norm())
+        turned = float(angle_between(rotation_of(other), rotation_of(best)))
+    return BeliefSummary(
+        float(translation), float(rotation), found.estimate.weight, second, away, turned
+    )
+
+
+def describe_belief(summary: BeliefSummary) -> tuple[str, str]:
+    """Return how sure a belief is, and what it says of a second pose: two sentences."""
+    rotation = math.degrees(summary.rotation)
+    angle = f"{rotation:.2g}" if rotation < 10 else f"{rotation:.0f}"
+    sure = f"sure to ±{format_length(summary.translation)}, ±{angle}°"
+    if summary.share == 0:
+        sure = "the estimate lies apart from the particles"
+    if summary.second is None:
+        return sure, "no second pose above 1 %"
+    away, turned = format_length(summary.second_translation), math.degrees(summary.second_rotation)
+    return sure, f"second pose {100 * summary.second.weight:.0f} %: {away} and {turned:.0f}° off"

@@ -31,7 +31,6 @@ def draw_detections(
     intrinsics: np.ndarray,
     detections: Sequence[Drawn],
     absent: Sequence[str] = (),
-    width: int = WIDTH,
     caption: str = "",
 ) -> np.ndarray:
     """Draw where poses put several objects, the nearest last.
@@ -41,13 +40,12 @@ def draw_detections(
         intrinsics: Its camera matrix (3, 3) [px].
         detections: What is drawn.
         absent: Names that the legend says are not in the image.
-        width: Of the result at least [px].
         caption: What is written below the legend.
 
     Returns:
         The picture (h, w, 3) uint8, with the legend below.
     """
-    view = full_view(rgb.shape[0], rgb.shape[1], max(width, rgb.shape[1]))
+    view = full_view(rgb.shape[0], rgb.shape[1], max(WIDTH, rgb.shape[1]))
     picture, shown = view.show(rgb), view.camera(intrinsics)
     colors = pick_colors(len(detections))
     for i in sorted(range(len(detections)), key=lambda i: -detections[i].pose[2, 3]):

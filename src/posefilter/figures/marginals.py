@@ -18,6 +18,7 @@ TRUTH: Color = (21, 153, 71)  # darker than on photographs: these are read on wh
 ESTIMATE: Color = (214, 33, 156)
 OBJECT_AXES = "xyz"
 CAMERA_AXES = ("right [mm]", "down [mm]", "away [mm]")
+_BINS = 25  # of a histogram
 _ABOUT = tuple(f"about {name} [degrees]" for name in OBJECT_AXES)
 
 
@@ -92,9 +93,7 @@ def draw_marginal(one: Marginal, label: str) -> np.ndarray:
     )
 
 
-def compute_histogram(
-    values: np.ndarray, weights: np.ndarray, marks: list[float], bins: int = 25
-) -> Marginal:
+def compute_histogram(values: np.ndarray, weights: np.ndarray, marks: list[float]) -> Marginal:
     """Return a weighted histogram of the middle 95 % and a margin, wide enough for the marks."""
     order = np.argsort(values)
     ends = np.searchsorted(np.cumsum(weights[order]), (0.025, 0.975)).clip(max=len(values) - 1)
@@ -102,7 +101,7 @@ def compute_histogram(
     margin = max(0.3 * (high - low), 1e-2)
     low, high = min(low - margin, *marks), max(high + margin, *marks)
     pad = 0.02 * (high - low)
-    places = np.linspace(low - pad, high + pad, bins + 1)
+    places = np.linspace(low - pad, high + pad, _BINS + 1)
     mass, edges = np.histogram(values, places, weights=weights)
     beyond = float(weights[(values < low - pad) | (values > high + pad)].sum())
     return Marginal(mass, edges, (*marks,), beyond)

@@ -20,6 +20,7 @@ _WORDS = (  # longitude and latitude [degrees], and what is there
     (-90, 0, "left"), (0, 0, "to the camera"), (90, 0, "right"),
     (0, -60, "60° down"), (0, -30, "30° down"), (0, 30, "30° up"), (0, 60, "60° up"),
 )  # fmt: skip
+_CLEARANCE = 70.0  # [px] of a mark, within which nothing is written
 _RIM = 0.01  # of the width, left free beside the map
 # the projection's auxiliary angle, tabled: 2 t + sin 2 t = pi sin(latitude)
 # denser at the poles, where it is steep
@@ -80,14 +81,13 @@ def _draw_blank(width: int) -> np.ndarray:
     return picture
 
 
-def label_map(picture: np.ndarray, taken: np.ndarray, clearance: float = 70.0) -> np.ndarray:
+def label_map(picture: np.ndarray, taken: np.ndarray) -> np.ndarray:
     """Return a map with its directions named: on top of what is drawn there, and away from places
     that are marked.
 
     Args:
         picture: A map of twice its height.
         taken: Places (M, 2) of marks [px].
-        clearance: How near to a mark nothing is written [px].
     """
     width = picture.shape[1]
     image = Image.fromarray(picture)
@@ -101,7 +101,7 @@ def label_map(picture: np.ndarray, taken: np.ndarray, clearance: float = 70.0) -
                 [{"m": 0, "l": half + 60, "r": -half - 60}[anchor[0]], 14 if down > 0 else -14]
             )
             gap = np.abs(taken.reshape(-1, 2) - middle) - [half, 14]
-            if (gap.max(1) > clearance / 2).all():
+            if (gap.max(1) > _CLEARANCE / 2).all():
                 place, where = (middle[0], at[1] + down), "m" + anchor[1]
                 pen.text(place, word, _INK, letters, where, stroke_width=5, stroke_fill=PAPER)
                 break

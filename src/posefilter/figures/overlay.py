@@ -26,6 +26,7 @@ from posefilter.figures.canvas import (
 from posefilter.images import to_camera, to_picture, to_pose
 from posefilter.meshes.mesh import Mesh
 from posefilter.rendering.embree import EmbreeRenderer, render_depth
+from posefilter.rendering.surfaces import project
 
 Shape = Mesh | np.ndarray | Tensor  # a mesh, or the (V, 3) vertices of a convex hull [m]
 WIDTH = 640  # [px] at least
@@ -98,7 +99,7 @@ def view_poses(
     for pose in poses:
         camera = corners @ pose[:3, :3].T + pose[:3, 3]
         if np.isfinite(camera).all() and (camera[:, 2] > _NEAR).all():
-            pixels = _project(camera, np.asarray(K, np.float64))
+            pixels = project(camera, np.asarray(K, np.float64))
             found.append(np.clip(pixels, 0, [width - 1, height - 1]))
     if not found:
         return full_view(height, width, shown)
@@ -145,7 +146,7 @@ def draw_axes(
     camera = ends @ pose[:3, :3].T + pose[:3, 3]
     if (camera[:, 2] < _NEAR).any():
         return
-    pixels = _project(camera, K)
+    pixels = project(camera, K)
     for axis in np.argsort(-camera[1:, 2]):
         draw_lines(picture, [pixels[[0, axis + 1]]], AXES[axis], width)
         draw_dots(picture, pixels[[axis + 1]], (0, 0, 0), width + 2)
@@ -168,7 +169,7 @@ def outline_object(
     camera = _clip_to_front(get_vertices(shape) @ pose[:3, :3].T + pose[:3, 3])
     if len(camera) < 3:
         return []
-    return [cv2.convexHull(_project(camera, K).astype(np.float32))[:, 0]]
+    return [cv2.convexHull(project(camera, K).astype(np.float32))[:, 0]]
 
 
 def render_silhouette(
@@ -208,10 +209,6 @@ def get_bounds(shape: Shape) -> np.ndarray:
     if isinstance(shape, Mesh):
         return shape.bounds
     return np.stack([get_vertices(shape).min(0), get_vertices(shape).max(0)])
-
-
-def _project(camera: np.ndarray, K: np.ndarray) -> np.ndarray:
-    return camera[:, :2] / camera[:, 2:] * K[[0, 1], [0, 1]] + K[:2, 2]
 
 
 def _clip_to_front(points: np.ndarray) -> np.ndarray:

@@ -1,22 +1,29 @@
 """Draw particles that are pixels on their way over an image, and what they see on it: the paper's
-figures 2 and 4.
+figures 2 and 4; and find the way of particles of any kind.
 """
+
+from collections.abc import Sequence
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from posefilter.figures.canvas import TRUTH, Color, View, draw_dots, draw_lines, draw_row, full_view
 from posefilter.figures.layout import CAPTION, DETAIL, WIDTH, compose_figure, draw_legend, draw_text
 from posefilter.figures.overlay import trace_outline
 from posefilter.figures.panels import arrange_row
-from posefilter.figures.particles import choose_steps
+from posefilter.figures.particles import choose_by_weight, choose_steps, normalize_weights
 from posefilter.geometry.lookup import overlaps_mask
+from posefilter.protocols import Encoding, HasImagePatches
+from posefilter.types import Particles, Trace
 
 ON: Color = (60, 220, 90)
 OFF: Color = (255, 80, 60)
 START: Color = (250, 220, 60)
 _ENDS = (("on the object", ON), ("off it", OFF))
 _NUMBER = 40  # [px] where a row's number stands
+_STEPS = 8  # at which a particle's glimpses are shown, at most
+_PARTICLES = 100  # whose ways are drawn, at most
 
 
 def find_hits(mask: np.ndarray, pixels: np.ndarray) -> np.ndarray:
@@ -27,16 +34,16 @@ def find_hits(mask: np.ndarray, pixels: np.ndarray) -> np.ndarray:
 
 
 def draw_trajectories(
-    rgb: np.ndarray, mask: np.ndarray, states: np.ndarray, title: str, max_particles: int = 100
+    rgb: np.ndarray, mask: np.ndarray, states: np.ndarray, title: str
 ) -> np.ndarray:
     """Draw where particles started (yellow), went (lines) and ended (green: on the object, red: off
     it).
 
-    rgb (H, W, 3) uint8; mask (H, W) bool; states (T, N, 2) [px], `max_particles` of which are
+    rgb (H, W, 3) uint8; mask (H, W) bool; states (T, N, 2) [px], of which a hundred are
     drawn. Half a frame more is shown on each side where a particle has left it.
     """
     H, W = mask.shape
-    path = states[:, :max_particles]
+    path = states[:, :_PARTICLES]
     on = find_hits(mask, path[-1])
     view = full_view(H, W, WIDTH)
     if ((path < -0.5) | (path > [W - 0.5, H - 0.5])).any():
@@ -60,13 +67,12 @@ def draw_glimpses(
     states: np.ndarray,
     patches: np.ndarray,
     title: str,
-    max_steps: int = 8,
 ) -> np.ndarray:
     """Draw what a few particles saw, a row a particle, below their way over the image.
 
     rgb (H, W, 3) uint8; mask (H, W) bool; states (T, n, 2) [px]; patches (T, n, k, k, 3) uint8.
-    Frames are green where the particle stands on the object, and red where not. max_steps: steps
-    that are shown, the first and the last among them.
+    Frames are green where the particle stands on the object, and red where not. Of the
+    steps eight are shown, the first and the last among them.
     """
     n, k = patches.shape[1:3]
     on = find_hits(mask, states)
@@ -79,7 +85,7 @@ def draw_glimpses(
         draw_dots(picture, way, np.array([ON if hit else OFF for hit in on[:, i]]), 4)
         draw_dots(picture, way[:1], START, 4)
         draw_label(picture, str(i + 1), way[-1])
-    shown = choose_steps(len(states), max_steps)
+    shown = choose_steps(len(states), _STEPS)
     size = min(90, (WIDTH - _NUMBER) // len(shown))
     heads = [draw_text(f"step {t}", DETAIL, size) for t in shown]
     rows = [arrange_row([draw_text("", CAPTION, _NUMBER), *heads])]
@@ -110,3 +116,35 @@ def draw_label(picture: np.ndarray, text: str, at: np.ndarray) -> None:
     v = int(np.clip(at[1] - 32, 0, picture.shape[0] - note.shape[0]))
     u = int(np.clip(at[0] + 6, 0, picture.shape[1] - note.shape[1]))
     picture[v : v + note.shape[0], u : u + note.shape[1]] = note
+
+
+def trace_lineage(history: Sequence[Particles]) -> Tensor:
+    """Return where each particle of the last step, and its ancestors before it, stood.  -> (B, T,
+    N, *S).
+    """
+    last = history[-1]
+    rows = torch.arange(len(last.state), device=last.state.device)[:, None]
+    index = torch.arange(last.state.shape[1], device=last.state.device).expand(len(last.state), -1)
+    path = []
+    for particles in reversed(history):
+        path.append(particles.state[rows, index])
+        index = particles.ancestors[rows, index]
+    return torch.stack(path[::-1], dim=1)
+
+
+def follow_particles(trace: Trace, max_particles: int = 8) -> Tensor:
+    """Return the ways of a few particles of one image, chosen by their last weight.  -> (T, n, 2)
+    [px].
+    """
+    chosen = choose_by_weight(normalize_weights(trace.particles[-1]), max_particles).unique()
+    return trace_lineage(trace.particles)[0][:, chosen]
+
+
+def extract_glimpses(method: HasImagePatches, encoding: Encoding, states: Tensor) -> np.ndarray:
+    """Return what particles see where they stand in one image, its colors.
+
+    (T, n, 2) [px] -> (T, n, k, k, 3) uint8.
+    """
+    seen = method.image_patches(encoding, states.flatten(0, 1)[None])[0, :, :3]
+    colors = ((seen + 1) / 2).clamp(0, 1).mul(255).round().byte().cpu()
+    return colors.unflatten(0, states.shape[:2]).permute(0, 1, 3, 4, 2).numpy()

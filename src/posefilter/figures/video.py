@@ -8,7 +8,7 @@ import numpy as np
 from cv2.utils import logging
 
 from posefilter.errors import Stopped, UserError
-from posefilter.figures.gif import encode_gif
+from posefilter.figures.animation import encode_gif
 from posefilter.files import write_whole
 
 _GIF_WIDTH = 480  # [px]

@@ -8,7 +8,6 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from scipy.spatial import ConvexHull, QhullError
 from torch import Tensor
 
 from posefilter.figures.canvas import to_image
@@ -18,7 +17,7 @@ from posefilter.geometry.camera import back_project, pixel_grid, project
 from posefilter.geometry.pose import origin_of
 from posefilter.geometry.spaces import PoseSpace
 from posefilter.geometry.symmetries import densify, gather_copies
-from posefilter.meshes.mesh import Mesh, creased_normals
+from posefilter.meshes.mesh import Mesh, creased_normals, find_hull
 from posefilter.protocols import Space
 from posefilter.types import Batch, ObjectModel, Trace
 
@@ -216,10 +215,7 @@ def make_mesh(shape: Shape, name: str) -> Mesh:
     if isinstance(shape, Mesh):
         return shape
     vertices = get_vertices(shape).astype(np.float64)
-    try:
-        hull = ConvexHull(vertices)
-    except QhullError:  # a flat object has no volume: joggle it
-        hull = ConvexHull(vertices, qhull_options="QJ")
+    hull = find_hull(vertices)
     faces = hull.simplices.astype(np.int64)
     a, b, c = (vertices[faces[:, i]] for i in range(3))
     # Qhull's triangles turn either way

@@ -1,5 +1,6 @@
 """Refinement by the measured depth: the iterative closest point method, with a prior."""
 
+from dataclasses import asdict, dataclass
 from typing import ClassVar, NamedTuple
 
 import torch
@@ -31,6 +32,7 @@ class Surface(NamedTuple):
     known: Tensor  # (B, P) bool: there is depth, and no edge of it
 
 
+@dataclass(eq=False)
 class PointToPlaneIcp:
     """Lay the estimate's surface on the measured depth: point-to-plane ICP (Chen and Medioni 1992).
 
@@ -56,27 +58,21 @@ class PointToPlaneIcp:
 
     requires: ClassVar[Capabilities] = ("depth", "pose")
 
-    def __init__(
-        self,
-        iterations: int = 5,
-        initial_gate: float = 0.015,
-        final_gate: float = 0.006,
-        prior: float = 0.004,
-        noise: float = 0.004,
-        effective: float = 120.0,
-        points: int = 500,
-    ) -> None:
-        least = min(iterations, final_gate, prior, noise, effective, points)
-        if not least > 0 or final_gate > initial_gate:
+    iterations: int = 5
+    initial_gate: float = 0.015
+    final_gate: float = 0.006
+    prior: float = 0.004
+    noise: float = 0.004
+    effective: float = 120.0
+    points: int = 500
+
+    def __post_init__(self) -> None:
+        given = asdict(self)
+        if not min(given.values()) > 0 or self.final_gate > self.initial_gate:
             raise UserError(
                 "refine: ICP needs numbers above 0, final_gate no larger than initial_gate; got "
-                f"iterations={iterations}, initial_gate={initial_gate}, final_gate={final_gate}, "
-                f"prior={prior}, noise={noise}, effective={effective}, points={points}"
+                f"{', '.join(f'{name}={value}' for name, value in given.items())}"
             )
-        self.iterations = iterations
-        self.initial_gate, self.final_gate = initial_gate, final_gate
-        self.prior, self.noise, self.effective = prior, noise, effective
-        self.points = points
 
     @torch.no_grad()
     def __call__(

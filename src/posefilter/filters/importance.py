@@ -10,8 +10,7 @@ from posefilter.capabilities import Capabilities
 from posefilter.errors import UserError
 from posefilter.filters.modes import find_pose_modes
 from posefilter.filters.refine import scorer_of
-from posefilter.geometry.pose_density import fit_density, log_density
-from posefilter.geometry.pose_sampling import draw_poses, widen
+from posefilter.geometry.pose_density import draw_poses, fit_density, log_density, widen
 from posefilter.geometry.spaces import PoseSpace
 from posefilter.protocols import Encoding, Method
 from posefilter.types import BeliefBatch

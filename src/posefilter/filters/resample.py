@@ -51,32 +51,26 @@ class InverseCDF:
         ancestors = inverse_cdf(log_w, uniforms)
         return Resampled(ancestors, log_w.new_full(ancestors.shape, -math.log(count)))
 
-    def uniforms(
-        self, rows: int, particles: int, generator: Generator, device: torch.device
-    ) -> Tensor:
-        """Return points of the unit interval, (rows, particles)."""
+    def uniforms(self, rows: int, count: int, generator: Generator, device: torch.device) -> Tensor:
+        """Return points of the unit interval, (rows, count)."""
         raise NotImplementedError
 
 
 class Multinomial(InverseCDF):
     """Independent draws, as in the bootstrap filter (Gordon et al. 1993); the largest variance."""
 
-    def uniforms(
-        self, rows: int, particles: int, generator: Generator, device: torch.device
-    ) -> Tensor:
+    def uniforms(self, rows: int, count: int, generator: Generator, device: torch.device) -> Tensor:
         """Return independent uniforms."""
-        return torch.rand(rows, particles, generator=generator, device=device)
+        return torch.rand(rows, count, generator=generator, device=device)
 
 
 class Stratified(InverseCDF):
     """One uniform in each of N equal strata (Kitagawa 1996)."""
 
-    def uniforms(
-        self, rows: int, particles: int, generator: Generator, device: torch.device
-    ) -> Tensor:
+    def uniforms(self, rows: int, count: int, generator: Generator, device: torch.device) -> Tensor:
         """Return one uniform of each stratum."""
-        u = torch.rand(rows, particles, generator=generator, device=device)
-        return (torch.arange(particles, device=device) + u) / particles
+        u = torch.rand(rows, count, generator=generator, device=device)
+        return (torch.arange(count, device=device) + u) / count
 
 
 class Systematic(InverseCDF):
@@ -85,12 +79,10 @@ class Systematic(InverseCDF):
     A particle of weight w has floor(N w) or ceil(N w) children.
     """
 
-    def uniforms(
-        self, rows: int, particles: int, generator: Generator, device: torch.device
-    ) -> Tensor:
+    def uniforms(self, rows: int, count: int, generator: Generator, device: torch.device) -> Tensor:
         """Return evenly spaced points with one random offset for each image."""
         u = torch.rand(rows, 1, generator=generator, device=device)
-        return (torch.arange(particles, device=device) + u) / particles
+        return (torch.arange(count, device=device) + u) / count
 
 
 class Soft:

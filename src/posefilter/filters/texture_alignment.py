@@ -23,7 +23,7 @@ from posefilter.filters.texture import (
 from posefilter.geometry.lookup import sample
 from posefilter.geometry.pose import origin_of, rotation_of
 from posefilter.geometry.spaces import PoseSpace
-from posefilter.protocols import Encoding, HasColor, Method
+from posefilter.protocols import Encoding, Method
 from posefilter.types import BeliefBatch, ObjectModel
 
 _FEW = 30  # textured points: fewer say nothing
@@ -125,7 +125,8 @@ class TextureAlignment:
         space = PoseSpace(tuple(object_model.center.tolist()), object_model.radius)
         precision = space.noise_scale(first.new_tensor(self.prior)).double().pow(-2).diag()
         surface = self.depth.choose_points(object_model.points).to(first)
-        sides, images = find_sides(own.normals), _images(encoding)
+        sides = find_sides(own.normals)
+        seen = (encoding.measured_color, encoding.measured_depth, encoding.intrinsics)
         pose, known = first, torch.zeros(len(first), dtype=torch.bool, device=first.device)
         moved = first.new_zeros(len(first), 6, dtype=torch.float64)
         for index in range(self.iterations):
@@ -133,8 +134,8 @@ class TextureAlignment:
             information, slope, _ = self.depth.measure(
                 pose, surface, object_model.center.to(first), encoding, self.gate
             )
-            for row, image in enumerate(images):
-                term = self._compare(pose[row], image, own, sides, object_model, blur)
+            for row, image in enumerate(zip(*seen, strict=True)):
+                term = self._compare(pose[row], *image, own, sides, object_model, blur)
                 known[row] = term is not None
                 if term is not None:
                     information[row] += term.information
@@ -149,7 +150,9 @@ class TextureAlignment:
     def _compare(
         self,
         pose: Tensor,
-        image: "_Image",
+        color: Tensor,
+        depth: Tensor,
+        K: Tensor,
         own: Print,
         sides: Tensor,
         object_model: ObjectModel,
@@ -159,15 +162,17 @@ class TextureAlignment:
 
         Args:
             pose: (4, 4) camera_from_object [m].
-            image: What it is compared with.
+            color: (3, H, W) of the image.
+            depth: (H, W) of the image [m].
+            K: (3, 3) of its camera [px].
             own: The object's textured points.
             sides: (P,) which side each is on.
             object_model: The object.
             blur: Of the image, in units of what suits the textured points' distance.
         """
-        K, focal = image.intrinsics, float(image.intrinsics[0, 0])
-        view = look_at_print(pose[None], image.depth, K, own, object_model)
-        size = view.pixels.new_tensor(image.color.shape[:0:-1])  # width, height
+        focal = float(K[0, 0])
+        view = look_at_print(pose[None], depth, K, own, object_model)
+        size = view.pixels.new_tensor(color.shape[:0:-1])  # width, height
         inside = (view.pixels > _RIM) & (view.pixels < size - 1 - _RIM)
         seen = (view.seen & inside.all(-1))[0]
         if int(seen.sum()) < _FEW:
@@ -175,7 +180,7 @@ class TextureAlignment:
         points, normals, cosine, pixels = (part[0, seen] for part in view[:4])
         center = origin_of(pose[None], object_model.center.to(pose))[0]
         sigma = blur * choose_blur(own, focal, float(center[2]))
-        y, along = _look_up(image.color, pixels, sigma)
+        y, along = _look_up(color, pixels, sigma)
         basis = torch.cat([torch.ones_like(cosine)[:, None], normals], dim=-1)
         x, y, weights, gain = _fit(own.color[seen], y, basis, cosine)
         power = weights[:, None] * x
@@ -203,19 +208,6 @@ class TextureAlignment:
         both = information[6:, :6]
         part = torch.linalg.solve(information[6:, 6:] + prior, both).mT
         return Term(information[:6, :6] - part @ both, slope[:6] - part @ slope[6:])
-
-
-class _Image(NamedTuple):
-    """One image."""
-
-    color: Tensor  # (3, H, W)
-    depth: Tensor  # (H, W) [m]
-    intrinsics: Tensor  # (3, 3)
-
-
-def _images(encoding: HasColor) -> list[_Image]:
-    parts = (encoding.measured_color, encoding.measured_depth, encoding.intrinsics)
-    return [_Image(*one) for one in zip(*parts, strict=True)]
 
 
 def find_sides(normals: Tensor) -> Tensor:

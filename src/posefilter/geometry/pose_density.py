@@ -22,10 +22,17 @@ import math
 from typing import NamedTuple
 
 import torch
-from torch import Tensor
+from torch import Generator, Tensor
 
-from posefilter.geometry.pose_kernels import measure_modes, measure_neighbors, whiten_kernels
-from posefilter.geometry.pose_twists import TwistParts, pair_twists, split_poses
+from posefilter.geometry.pose import move_about
+from posefilter.geometry.pose_kernels import (
+    TwistParts,
+    measure_modes,
+    measure_neighbors,
+    pair_twists,
+    split_poses,
+    whiten_kernels,
+)
 from posefilter.geometry.symmetries import gather_copies
 
 BACKGROUND = 0.01  # of the mass
@@ -212,3 +219,42 @@ def _thin(log_weights: Tensor, max_kernels: int) -> tuple[Tensor, Tensor]:
     stands_for = (log_weights[rest].logsumexp(0) - log_weights[few].logsumexp(0)).nan_to_num(0.0)
     shares = torch.cat([log_weights[heavy], log_weights[few] + stands_for])
     return torch.cat([heavy, few]), shares.log_softmax(0)
+
+
+def widen(density: PoseDensity, factor: float) -> PoseDensity:
+    """Return the density with kernels that are wider by a factor, turns up to where they would
+    wrap round.
+    """
+    covariance = factor**2 * measure_kernels(density)
+    whiten, log_scale = whiten_kernels(covariance)
+    return density._replace(whiten=whiten, log_scale=log_scale)
+
+
+def measure_kernels(density: PoseDensity) -> Tensor:
+    """Return the covariances of the kernels' twists.  -> (N, 6, 6) [m^2, m rad, rad^2]."""
+    root = torch.linalg.inv(density.whiten)
+    return root @ root.mT
+
+
+def draw_poses(density: PoseDensity, count: int, generator: Generator) -> Tensor:
+    """Draw poses from a density's kernels, not from its background.
+
+    Of symmetric objects only the copies of the kernels themselves are drawn.
+
+    Args:
+        density: Of poses.
+        count: Number of poses.
+        generator: Source of randomness, on the density's device.
+
+    Returns:
+        (count, 4, 4) camera_from_object [m], float64.
+    """
+    device, dtype = density.center.device, density.center.dtype
+    # systematic: one uniform number decides where all strata are hit
+    start = torch.rand((), generator=generator, device=device, dtype=dtype)
+    position = (torch.arange(count, device=device, dtype=dtype) + start) / count
+    kernel = torch.searchsorted(density.log_weights.exp().cumsum(0), position)
+    kernel = kernel.clamp(max=len(density.log_weights) - 1)
+    noise = torch.randn(count, 6, generator=generator, device=device, dtype=dtype)
+    twist = torch.linalg.solve_triangular(density.whiten[kernel], noise[..., None], upper=False)
+    return move_about(density.matrices[kernel], twist[..., 0], density.center)

@@ -1,17 +1,51 @@
-"""The shapes of kernels over poses: covariances of the twists to neighbors, or within a mode."""
+"""The shapes of kernels over poses: covariances of the twists to neighbors, or within a mode.
+
+Twists between all pairs of two sets of poses are computed by quaternions.
+"""
 
 import math
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from posefilter.geometry.pose_twists import TwistParts, pair_twists
+from posefilter.geometry.pose import origin_of, rotation_of
+from posefilter.geometry.rotation import quat_xyzw_from_matrix
 
 _SHRINK = 8.0  # poses that the modes' common covariance counts as
 _ISOTROPIC = 0.05  # share of a kernel's covariance that has no direction
 _WIDEST = 0.6  # [rad] so that five standard deviations end before half a turn
 _CHUNK = 1 << 17  # pairs of poses held at once
+
+
+class TwistParts(NamedTuple):
+    """Poses, as what twists between them are made of."""
+
+    center: Tensor  # (N, 3) position of the object's center [m]
+    quaternion: Tensor  # (N, 4), x, y, z, w
+
+    def select(self, index: Tensor) -> "TwistParts":
+        """Return some of the poses."""
+        return TwistParts(self.center[index], self.quaternion[index])
+
+
+def split_poses(poses: Tensor, center: Tensor) -> TwistParts:
+    """Return what twists between poses are made of.  (N, 4, 4), (3,) [m] -> N."""
+    return TwistParts(origin_of(poses, center), quat_xyzw_from_matrix(rotation_of(poses)))
+
+
+def pair_twists(start: TwistParts, end: TwistParts) -> Tensor:
+    """Return the twists that move N poses to M others, as `twist_between` does.  -> (N, M, 6)."""
+    shift = end.center[None] - start.center[:, None]
+    a, b = start.quaternion[:, None], end.quaternion[None]
+    va, vb, wa, wb = a[..., :3], b[..., :3], a[..., 3:], b[..., 3:]
+    vector = wa * vb - wb * va - torch.linalg.cross(*torch.broadcast_tensors(va, vb))
+    w = wa * wb + (va * vb).sum(-1, keepdim=True)
+    sine = vector.norm(dim=-1, keepdim=True)
+    angle = 2 * torch.atan2(sine, w.abs())
+    scale = torch.where(sine > 1e-9, angle / sine.clamp_min(1e-9), torch.full_like(sine, 2.0))
+    return torch.cat([shift, scale * vector * torch.where(w < 0, -1.0, 1.0)], dim=-1)
 
 
 def measure_neighbors(
@@ -45,10 +79,7 @@ def measure_neighbors(
                 own, share = own.gather(1, near[..., None].expand(-1, -1, 6)), weights[near]
             share = (share / share.sum(1, keepdim=True))[..., None]
             own = own - (share * own).sum(1, keepdim=True)
-            covariance = (share * own).mT @ own
-            size = covariance.diagonal(dim1=1, dim2=2).mean(1)[:, None, None]
-            blunt = _ISOTROPIC * size * torch.eye(6).to(covariance)
-            found[number].append((1 - _ISOTROPIC) * covariance + blunt)
+            found[number].append(_blunt((share * own).mT @ own))
     return [torch.cat(one) for one in found]
 
 
@@ -76,10 +107,14 @@ def measure_modes(parts: TwistParts, weights: Tensor, member: Tensor, unit: Tens
         counts.append(float(1 / share.square().sum()) - 1)
     each, effective = torch.stack(found), weights.new_tensor(counts)[:, None, None]
     common = (effective * each).sum(0) / effective.sum().clamp_min(1e-9)
-    covariance = (effective * each + _SHRINK * common) / (effective + _SHRINK)
+    return _blunt((effective * each + _SHRINK * common) / (effective + _SHRINK))[member]
+
+
+def _blunt(covariance: Tensor) -> Tensor:
+    """Return covariances (N, 6, 6) of which a share has no direction, of the same mean variance."""
     size = covariance.diagonal(dim1=1, dim2=2).mean(1)[:, None, None]
-    blunt = _ISOTROPIC * size * torch.eye(6).to(covariance)
-    return ((1 - _ISOTROPIC) * covariance + blunt)[member]
+    even = _ISOTROPIC * size * torch.eye(6).to(covariance)
+    return (1 - _ISOTROPIC) * covariance + even
 
 
 def whiten_kernels(covariance: Tensor) -> tuple[Tensor, Tensor]:

@@ -195,23 +195,28 @@ def surface_colors(mesh: Mesh, face: np.ndarray, weights: np.ndarray) -> np.ndar
     return color * tint.astype(np.float32)
 
 
-def hull_vertices(vertices: np.ndarray) -> np.ndarray:
-    """Return the vertices of the convex hull.  (V, 3) -> (H, 3).
+def find_hull(vertices: np.ndarray) -> ConvexHull:
+    """Return the convex hull of vertices (V, 3).
 
     Raises UserError where there is none.
     """
     try:
-        return vertices[ConvexHull(vertices).vertices]
+        return ConvexHull(vertices)
     except QhullError:  # a flat mesh has no volume: joggle it
         pass
     try:
-        return vertices[ConvexHull(vertices, qhull_options="QJ").vertices]
+        return ConvexHull(vertices, qhull_options="QJ")
     except QhullError as error:
         size = float(np.ptp(vertices, axis=0).max())
         raise UserError(
             f"mesh: has no convex hull; {size:.3g} m across, it is a point or too small: mind the "
             f"unit (mesh_scale)"
         ) from error
+
+
+def hull_vertices(vertices: np.ndarray) -> np.ndarray:
+    """Return the vertices of the convex hull; errors as of `find_hull`.  (V, 3) -> (H, 3)."""
+    return vertices[find_hull(vertices).vertices]
 
 
 def outline_hull(vertices: np.ndarray, max_vertices: int = _HULL_VERTICES) -> np.ndarray:

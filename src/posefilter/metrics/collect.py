@@ -17,6 +17,9 @@ from posefilter.metrics.errors import NearestPoint, add, add_s, add_up_to_symmet
 from posefilter.metrics.scores import summarize, summarize_rows
 from posefilter.types import BeliefBatch, ObjectModel
 
+# of visibility; lower end included, upper only at 1
+RANGES = ((0.0, 0.3), (0.3, 0.5), (0.5, 0.8), (0.8, 1.0), (0.5, 1.0), (0.6, 1.0))
+
 
 def concat_state(state: Any) -> Tensor:
     """Return a list state as one tensor, empty if nothing was accumulated."""
@@ -89,6 +92,49 @@ def summarize_errors(rows: Tensor, models: Sequence[ObjectModel]) -> dict[str, d
     if any(len(model.symmetries) > 1 for model in models):
         blocks["add_up_to_symmetry"] = summarize(rows[:, 3], rows[:, 2])
     return blocks
+
+
+def lies_within(visible: Tensor, low: float, high: float) -> Tensor:
+    """Tell which visible shares (N,) lie in a range: its lower end does, its upper only at 1."""
+    return (visible >= low) & ((visible < high) if high < 1 else (visible <= 1))
+
+
+class ErrorsByVisibility(Rows):
+    """ADD and ADD-S of the instances in each range of visibility: means over all images hide the
+    effect of occlusion. Unknown visibility is in none.
+
+    Args:
+        models: The objects.
+        ranges: Lower (inclusive) and upper ends (exclusive, except 1).
+        **kwargs: Arguments of torchmetrics.Metric.
+    """
+
+    def __init__(
+        self,
+        models: Sequence[ObjectModel],
+        ranges: Sequence[tuple[float, float]] = RANGES,
+        **kwargs: Any,
+    ) -> None:
+        super().__init__(**kwargs)
+        self.models, self.ranges = list(models), tuple(ranges)
+
+    def update(self, errors: Tensor, visibility: Tensor) -> None:
+        """Accumulate the rows of PoseErrors, (B, 4), with the instances' visible shares (B,)."""
+        self.rows.append(torch.cat([errors, visibility.to(errors)[:, None]], dim=1))
+
+    def compute(self) -> dict[str, Any]:
+        """Return {"0.3-0.5": {"instances", "add": {...}, "add_s": {...}}, ...} without empty
+        ranges.
+        """
+        rows = concat_state(self.rows).reshape(-1, 5)
+        visible = rows[:, 4]
+        out = {}
+        for low, high in self.ranges:
+            selected = lies_within(visible, low, high)
+            if bool(selected.any()):
+                blocks = summarize_errors(rows[selected, :4], self.models)
+                out[f"{low:g}-{high:g}"] = {"instances": int(selected.sum()), **blocks}
+        return out
 
 
 class Average(Metric):

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from posefilter.geometry.pose_density import fit_density, log_density, log_density_held_out
-from posefilter.metrics.collect import Rows, concat_state
+from posefilter.metrics.collect import Rows, concat_state, lies_within
 from posefilter.types import BeliefBatch, ObjectModel
 
 LEVELS = tuple(round(0.05 * k, 2) for k in range(1, 20))  # of the coverage curve
@@ -88,7 +88,7 @@ def trace_curves(rank: Tensor, visible: Tensor) -> dict[str, Any]:
     """
     quarters = []
     for low, high in QUARTERS:
-        own = (visible >= low) & ((visible < high) if high < 1 else (visible <= 1))
+        own = lies_within(visible, low, high)
         if bool(own.any()):
             one = {"from": low, "to": high, "instances": int(own.sum())}
             quarters.append({**one, "coverage": trace_curve(rank[own])})

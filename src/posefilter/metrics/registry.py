@@ -8,7 +8,7 @@ and `diagnostics/off_frame/last`.  `filter/...` are the filter's quantities by i
 
 import math
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 from posefilter.errors import UserError
@@ -127,33 +127,20 @@ def _describe_bop(name: str, unit: str, thresholds: str) -> tuple[MetricInfo, ..
     )
 
 
-def _describe_credible() -> tuple[MetricInfo, ...]:
+def _describe_coverage(
+    key: str, what: str, short: str, meaning: str, levels: Sequence[int]
+) -> tuple[MetricInfo, ...]:
+    """Return the share of the truths in a kind of set, of several levels; `meaning` takes one."""
     return tuple(
         _percent(
-            f"credibility/coverage_{level}",
-            f"coverage of the {level} % credible set",
+            f"{key}_{level}",
+            f"coverage of the {level} % {what}",
             ".0f",
             HIGHER if level == 90 else NEITHER,  # most are too low; see diagnostics
-            f"{level} % credible set",
-            f"truths in the highest-density set: {level} where calibrated; fewer: wrong or too "
-            "narrow",
+            f"{level} % {short}",
+            meaning.format(level),
         )
-        for level in (50, 80, 90, 95)
-    )
-
-
-def _describe_regions() -> tuple[MetricInfo, ...]:
-    return tuple(
-        _percent(
-            f"belief/distance_coverage_{level}",
-            f"coverage of the {level} % mean-distance region",
-            ".0f",
-            HIGHER if level == 90 else NEITHER,
-            f"{level} % distance region",
-            f"truths whose mean distance to the particles is within the belief's {level} % "
-            f"quantile: {level} where calibrated; fewer: wrong, or too narrow",
-        )
-        for level in (50, 90)
+        for level in levels
     )
 
 
@@ -191,13 +178,17 @@ _METRICS = (
     MetricInfo("belief/rank", "rank of the truth by mean distance", form=".2f",
         meaning="share of the belief that is nearer to the particles than the truth; 0.5 where "
         "calibrated; near 1: the truth lies outside"),
-    *_describe_regions(),
+    *_describe_coverage("belief/distance_coverage", "mean-distance region", "distance region",
+        "truths whose mean distance to the particles is within the belief's {0} % quantile: {0} "
+        "where calibrated; fewer: wrong, or too narrow", (50, 90)),
     MetricInfo("credibility/log_density", "log density of the truth, mean", "nat", ".2f", HIGHER,
         short="log density",
         meaning="per cubic meter, and per unit of rotation where SO(3) has the volume pi²"),
     MetricInfo("credibility/log_density_p50", "log density of the truth, median", "nat", ".2f",
         HIGHER, meaning="over the images; the same unit"),
-    *_describe_credible(),
+    *_describe_coverage("credibility/coverage", "credible set", "credible set",
+        "truths in the highest-density set: {0} where calibrated; fewer: wrong or too narrow",
+        (50, 80, 90, 95)),
     _share("belief/truth_outscored", "images in which a particle outscores the truth", LOWER,
         "by any pose"),
     _share("belief/truth_outscored_by_wrong", "images in which a wrong pose outscores the truth",

@@ -6,8 +6,6 @@ those of the challenge since 2019 (`vsd` and `estimate_visib_mask` of bop_toolki
 the cost of a pixel is a step, and a pixel without measured depth counts as visible.
 """
 
-from collections.abc import Sequence
-
 import numpy as np
 
 DELTA = 0.015  # [m] tolerance of visibility, that of the challenge for most datasets
@@ -37,8 +35,6 @@ def vsd(
     measured: np.ndarray,
     intrinsics: np.ndarray,
     diameter: float,
-    taus: Sequence[float] = TAUS,
-    delta: float = DELTA,
 ) -> np.ndarray:
     """Return the visible surface discrepancy.
 
@@ -48,23 +44,21 @@ def vsd(
         measured: (H, W) depth of the image [m], 0 where unknown.
         intrinsics: (3, 3) camera matrix [px].
         diameter: The object's diameter [m].
-        taus: Misalignments of a pixel that count as wrong, in diameters.
-        delta: Tolerance of visibility [m].
 
     Returns:
-        (T,) in [0, 1], for each of `taus`; 1 where nothing is visible of either.
+        (T,) in [0, 1], for each of `TAUS`; 1 where nothing is visible of either.
     """
     there, guess, seen = (to_distance(d, intrinsics) for d in (truth, estimate, measured))
-    visible = _is_visible(there, seen, delta)
-    claimed = _is_visible(guess, seen, delta) | (visible & (guess > 0))
+    visible = _is_visible(there, seen)
+    claimed = _is_visible(guess, seen) | (visible & (guess > 0))
     both, either = visible & claimed, int((visible | claimed).sum())
     if either == 0:
-        return np.ones(len(taus))
+        return np.ones(len(TAUS))
     apart = np.abs(there[both] - guess[both]) / diameter
     alone = either - int(both.sum())
-    return np.array([(int((apart >= tau).sum()) + alone) / either for tau in taus])
+    return np.array([(int((apart >= tau).sum()) + alone) / either for tau in TAUS])
 
 
-def _is_visible(model: np.ndarray, seen: np.ndarray, delta: float) -> np.ndarray:
+def _is_visible(model: np.ndarray, seen: np.ndarray) -> np.ndarray:
     """Return where a rendered object is not hidden, by distances (H, W) [m]."""
-    return (model > 0) & ((model - seen <= delta) | (seen == 0))
+    return (model > 0) & ((model - seen <= DELTA) | (seen == 0))

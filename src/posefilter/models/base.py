@@ -185,11 +185,16 @@ class PoseEstimator(Module):
         # torchmetrics: prediction needs none
         from posefilter.metrics.apparent_size import ApparentSizes
         from posefilter.metrics.bop import BopErrors
-        from posefilter.metrics.collect import BeliefQuality, BoxIoU, ParticlesOnObject, PoseErrors
+        from posefilter.metrics.collect import (
+            BeliefQuality,
+            BoxIoU,
+            ErrorsByVisibility,
+            ParticlesOnObject,
+            PoseErrors,
+        )
         from posefilter.metrics.confidence import Confidence
         from posefilter.metrics.credibility import Credibility
         from posefilter.metrics.parts import PartIoU
-        from posefilter.metrics.visibility import ErrorsByVisibility
 
         metrics: dict[str, nn.Module] = {
             "iou": BoxIoU(),

@@ -1,6 +1,7 @@
 """Candidates that the pose-space method's likelihood is trained on, as a trace of one step."""
 
 import math
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar, Protocol, runtime_checkable
 
 import torch
@@ -174,6 +175,7 @@ def pick_pixels(usable: Tensor, count: int | None, generator: Generator) -> tupl
     return pick[:, :longest], drawn[:, :longest] > 0
 
 
+@dataclass(eq=False)
 class LabeledRays(CandidateSampler):
     """The paper's samples: points along the rays of the object's pixels, scored singly (section 5).
 
@@ -190,16 +192,11 @@ class LabeledRays(CandidateSampler):
     provides: ClassVar[Capabilities] = ("ray_samples",)
     requires: ClassVar[Capabilities] = ("score_samples",)
 
-    def __init__(
-        self,
-        rays: int | None = 64,
-        samples: int = 30,
-        min_depth: float = 0.10,
-        margin_behind: float = 0.05,
-        tolerance: float = 0.01,
-    ) -> None:
-        self.rays, self.samples, self.min_depth = rays, samples, min_depth
-        self.margin_behind, self.tolerance = margin_behind, tolerance
+    rays: int | None = 64
+    samples: int = 30
+    min_depth: float = 0.10
+    margin_behind: float = 0.05
+    tolerance: float = 0.01
 
     def __call__(
         self, method: "PosePF", encoding: Encoding, batch: Batch, generator: Generator

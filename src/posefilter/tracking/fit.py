@@ -4,6 +4,8 @@ A tracked pose is near the maximum, and only a few poses can be scored in a fram
 by the likelihood rests on the few of them that score highest; a regression uses all alike.
 """
 
+from dataclasses import dataclass
+
 import torch
 from torch import Generator, Tensor
 
@@ -14,6 +16,7 @@ from posefilter.types import BeliefBatch
 _LONGEST = 1.5  # standard deviations of the perturbations, by which an iteration moves at most
 
 
+@dataclass(eq=False)
 class QuadraticFit:
     """Move the estimate to the maximum of a quadratic fitted to the scores about it: a `Refine`.
 
@@ -37,17 +40,12 @@ class QuadraticFit:
             Statistical Society B 13 (1951).
     """
 
-    def __init__(
-        self,
-        iterations: int = 1,
-        pairs: int = 16,
-        spread: float = 0.006,
-        sigma: float = 0.004,
-        pixels: int = 256,
-        prior_std: float = 2.0,
-    ) -> None:
-        self.iterations, self.pairs, self.spread, self.sigma = iterations, pairs, spread, sigma
-        self.pixels, self.prior_std = pixels, prior_std
+    iterations: int = 1
+    pairs: int = 16
+    spread: float = 0.006
+    sigma: float = 0.004
+    pixels: int = 256
+    prior_std: float = 2.0
 
     @torch.no_grad()
     def __call__(

@@ -16,8 +16,8 @@ from pathlib import Path
 from typing import Any
 
 from posefilter.errors import UserError
-from posefilter.tracking.frame import Frame
 from posefilter.tracking.track import Track, TrackResult
+from posefilter.tracking.window import Frame
 from posefilter.tracking.worker import Start, Task, restore
 
 _MOST_RESTARTS = 10  # of processes that ended

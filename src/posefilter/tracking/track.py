@@ -28,17 +28,14 @@ from posefilter.images import Images
 from posefilter.models.base import PoseEstimator
 from posefilter.protocols import Refine
 from posefilter.result import Result, Run, make_result
-from posefilter.tracking.estimate import ModeMean, smooth
+from posefilter.tracking.components import FromBelief, ModeMean, RotateTogether, smooth
 from posefilter.tracking.fit import QuadraticFit
-from posefilter.tracking.frame import Frame
 from posefilter.tracking.kld import bin_poses, count_needed
 from posefilter.tracking.objectness import measure_objectness, measure_presence
-from posefilter.tracking.predict import FromBelief
-from posefilter.tracking.rotate import RotateTogether
 from posefilter.tracking.scoring import FrameScorer, check_method
 from posefilter.tracking.settings import FilterSettings, TrackerSettings
 from posefilter.tracking.track_loss import LOST, TRACKED, TrackLossDetector
-from posefilter.tracking.window import Window, place_window
+from posefilter.tracking.window import Frame, Window, place_window
 from posefilter.types import Batch, BeliefBatch, Particles, Trace
 
 _WIDE = 0.04  # [m] the highest level at which a tracked frame is measured

@@ -10,10 +10,10 @@ from posefilter.devices import take_threads
 from posefilter.errors import UserError, check_seed
 from posefilter.estimator import Estimator, get_trained_size
 from posefilter.images import Images, as_array, check_depth_unit, check_images, check_intrinsics
-from posefilter.tracking.frame import Frame
 from posefilter.tracking.processes import MultiprocessTracker
 from posefilter.tracking.settings import TrackerSettings
 from posefilter.tracking.track import Track, TrackResult
+from posefilter.tracking.window import Frame
 
 
 class Tracker:

@@ -15,8 +15,8 @@ import torch
 
 from posefilter.images import Images
 from posefilter.memory import keep_freed_memory
-from posefilter.tracking.frame import Frame
 from posefilter.tracking.track import Track, TrackResult, TrackSnapshot
+from posefilter.tracking.window import Frame
 
 _OF_METHOD = ("object_model", "calibration")  # attributes of a result that both processes have
 

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from posefilter.callbacks.trajectories import extract_glimpses, follow_particles, trace_lineage
+from posefilter.figures.trajectories import extract_glimpses, follow_particles, trace_lineage
 from posefilter.nets.glimpse import IntegerCut
 from posefilter.types import BeliefBatch, ParticleOutput, Particles, Step, Trace
 
