@@ -107,6 +107,15 @@ def test_a_distortion_is_not_passed_over(tmp_path: Path) -> None:
     assert read_intrinsics(str(path), distorted=True).K[0, 0] == 900
 
 
+def test_typed_matrices_are_judged_as_those_of_files_are() -> None:
+    """A skew that moves points by less than a pixel is no reason to refuse a calibration."""
+    assert read_intrinsics("900,0.4,320,0,900,240,0,0,1").K[0, 1] == 0.4
+    with pytest.raises(UserError, match="skew 40 px"):
+        read_intrinsics("900,40,320,0,900,240,0,0,1")
+    with pytest.raises(UserError, match="transposed"):
+        read_intrinsics("900,0,0,0,900,0,320,240,1")
+
+
 @pytest.mark.parametrize(
     ("content", "told"),
     [

@@ -29,6 +29,7 @@ from posefilter.figures.detections import Drawn, draw_detections
 from posefilter.figures.overlay import Shape
 from posefilter.figures.recording import record
 from posefilter.figures.view_data import collect_view_data
+from posefilter.geometry.camera import find_matrix_flaw
 from posefilter.geometry.lens import read_distortion, undistort_most
 from posefilter.images import check_images, drop_unknown
 from posefilter.meshes.ycb import number_objects
@@ -397,19 +398,17 @@ def read_intrinsics(typed: Any, distorted: bool = False) -> CameraFile:
                 f"intrinsics={typed}: expected four numbers, fx,fy,cx,cy [px], or a camera's file"
             ) from error
         return _read_camera(Path(str(parts[0])), distorted)
-    if len(values) == 9:
-        fx, skew, cx, below, fy, cy, *last = values
-        if (below, *last) != (0, 0, 0, 1) or abs(skew) > 0:
-            raise UserError(f"intrinsics={typed}: is no matrix fx,0,cx,0,fy,cy,0,0,1")
-        values = [fx, fy, cx, cy]
-    if len(values) != 4:
+    if len(values) not in (4, 9):
         raise UserError(f"intrinsics={typed}: expected four numbers, fx,fy,cx,cy [px]")
-    fx, fy, cx, cy = values
     if not np.isfinite(values).all():
         raise UserError(f"intrinsics={typed}: hold NaN or infinity")
-    if fx <= 0 or fy <= 0:
-        raise UserError(f"intrinsics={typed}: focal lengths must be positive [px]")
-    return CameraFile(np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]))
+    if len(values) == 4:
+        fx, fy, cx, cy = values
+        values = [fx, 0, cx, 0, fy, cy, 0, 0, 1]
+    K = np.array(values).reshape(3, 3)
+    if flaw := find_matrix_flaw(K):
+        raise UserError(f"intrinsics={typed}: are no camera's ({flaw})")
+    return CameraFile(K)
 
 
 def _read_camera(path: Path, distorted: bool) -> CameraFile:
