@@ -78,9 +78,9 @@ def test_errors_of_a_batch_are_in_its_order() -> None:
     errors = PoseErrors([object_model(0.2), object_model(0.4)])
     guess = shifted([0.01, float("nan"), 0.03, 0.02])
     errors.update(guess, shifted([0.0] * 4), torch.tensor([1, 0, 0, 1]))
-    add, _, diameter, _ = errors.rows[-1].T.tolist()
-    assert add == pytest.approx([0.01, math.inf, 0.03, 0.02], abs=1e-6)
-    assert diameter == pytest.approx([0.4, 0.2, 0.2, 0.4])
+    add, _, diameter, _ = errors.last()
+    assert add.tolist() == pytest.approx([0.01, math.inf, 0.03, 0.02], abs=1e-6)
+    assert diameter.tolist() == pytest.approx([0.4, 0.2, 0.2, 0.4])
 
 
 class Method(torch.nn.Module):

@@ -1,12 +1,12 @@
 """How well a probability tells right from wrong, and whether it means what it says."""
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 from torchmetrics.functional.classification import binary_calibration_error
 
-from posefilter.metrics.collect import Rows, concat_state
+from posefilter.metrics.collect import Rows
 from posefilter.metrics.diagnostics import auroc
 
 COVERAGE = 0.8  # share of the images that are kept where an error rate is given
@@ -64,7 +64,17 @@ def error_at_coverage(probability: Tensor, correct: Tensor, coverage: float = CO
     return (wrong[above].sum() + share * wrong[equal].sum()) / kept
 
 
-class Confidence(Rows):
+class ConfidenceColumns(NamedTuple):
+    """The probabilities of N frames, and what is true of them: (N,) each."""
+
+    presence: Tensor  # probability that the object is there
+    probability: Tensor  # that it is there and its pose right
+    present: Tensor  # bool; the object is in the image
+    correct: Tensor  # bool; and the pose within the tolerance
+    verdict: Tensor  # 1 where it is found, -1 where absent, 0 where unsure
+
+
+class Confidence(Rows[ConfidenceColumns]):
     """The quality of calibrated probabilities, over frames with and without the object.
 
     auroc: of the probability, right against wrong poses, among frames with the object.
@@ -75,6 +85,8 @@ class Confidence(Rows):
     one is found. bins: the reliability diagram over all frames.
     """
 
+    columns = ConfidenceColumns
+
     def update(
         self,
         presence: Tensor,
@@ -83,21 +95,13 @@ class Confidence(Rows):
         correct: Tensor,
         verdict: Tensor,
     ) -> None:
-        """Accumulate estimates.
-
-        Args:
-            presence: (B,) probabilities.
-            probability: (B,) likewise.
-            present: (B,) bool, the object is in the image.
-            correct: (B,) bool, and the pose within 0.1 diameters.
-            verdict: (B,) 1 where it is found, -1 where absent, 0 where unsure.
-        """
+        """Accumulate the estimates of B frames: (B,) each, as of `ConfidenceColumns`."""
         columns = (presence, probability, present, correct, verdict)
-        self.rows.append(torch.stack([x.double().cpu() for x in columns], dim=1))
+        self.append(ConfidenceColumns(*(column.cpu() for column in columns)))
 
     def compute(self) -> dict[str, Any]:
         """Return the numbers; those that need frames of a kind that is missing are NaN."""
-        presence, probability, there, right, verdict = concat_state(self.rows).T
+        presence, probability, there, right, verdict = self.all()
         own, is_right = there > 0, right > 0
         with_object, declared = probability[own], verdict[own]
         return {

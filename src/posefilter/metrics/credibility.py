@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from posefilter.geometry.pose_density import fit_density, log_density, log_density_held_out
-from posefilter.metrics.collect import Rows, concat_state, lies_within
+from posefilter.metrics.collect import Rows, lies_within
 from posefilter.types import BeliefBatch, ObjectModel
 
 LEVELS = tuple(round(0.05 * k, 2) for k in range(1, 20))  # of the coverage curve
@@ -54,32 +54,38 @@ def score_truth(belief: BeliefBatch, truth: Tensor, object_model: ObjectModel) -
     return TruthScores(*(torch.stack(rows) if rows else torch.zeros(0, 3)).double().T)
 
 
-class Credibility(Rows):
+class CredibilityColumns(NamedTuple):
+    """How the beliefs of N images see the truth: (N,) each."""
+
+    log_density: Tensor  # as of `TruthScores`
+    rank: Tensor
+    nonconformity: Tensor
+    visibility: Tensor  # share of the object that is visible, NaN where unknown
+
+
+class Credibility(Rows[CredibilityColumns]):
     """The density of beliefs at the truth, and the coverage of credible sets, by visibility.
 
     log_density, log_density_p50: of the truth, mean and median [nat].  coverage_50, ...: percentage
     of the images whose credible set of that level holds the truth.  levels, all, quarters: curves.
     """
 
+    columns = CredibilityColumns
+
     def update(self, scores: TruthScores, visibility: Tensor) -> None:
         """Accumulate scores (B,) with the objects' visible shares (B,), NaN where unknown."""
-        self.rows.append(torch.stack([*scores, visibility.double().cpu()], dim=1))
-
-    def last(self) -> TruthScores:
-        """Return the scores that were accumulated last."""
-        return TruthScores(*self.rows[-1][:, :3].T)
+        self.append(CredibilityColumns(*scores, visibility.cpu()))
 
     def compute(self) -> dict[str, Any]:
         """Return the numbers; empty without images."""
-        rows = concat_state(self.rows)
-        if not len(rows):
+        density, rank, _, visibility = self.all()
+        if not len(rank):
             return {}
-        density, rank = rows[:, 0], rows[:, 1]
         median = float(np.median(density.numpy()))
         out = {"log_density": float(density.mean()), "log_density_p50": median}
         for percent in SHOWN:
             out[f"coverage_{percent}"] = 100 * measure_coverage(rank, percent / 100)
-        return {**out, **trace_curves(rank, rows[:, 3])}
+        return {**out, **trace_curves(rank, visibility)}
 
 
 def trace_curves(rank: Tensor, visible: Tensor) -> dict[str, Any]:

@@ -453,7 +453,7 @@ class PoseEstimator(Module):
         if "poses" in self.scores:
             self.scores["poses"].update(best, true_pose)
             self.scores["bop"].update(best, true_pose, batch.intrinsics, width)
-            self.scores["by_visibility"].update(self.scores["poses"].rows[-1], batch.visibility)
+            self.scores["by_visibility"].update(self.scores["poses"].last(), batch.visibility)
             found = self.judge_confidence(trace, batch, present=True)
             belief, _ = self.calibrate_belief(trace.belief, found)
             self.last_belief = belief
@@ -469,8 +469,8 @@ class PoseEstimator(Module):
         """
         if self.calibration is None or "confidence" not in self.scores:
             return Assessment(*torch.full((2, count), torch.nan, dtype=torch.float64))
-        presence, probability = self.scores["confidence"].rows[-1][:, :2].T
-        return Assessment(presence, probability)
+        judged = self.scores["confidence"].last()
+        return Assessment(judged.presence, judged.probability)
 
     def judge_confidence(self, trace: Trace, batch: Batch, present: bool) -> Assessment | None:
         """Add a batch's probabilities, where the method is calibrated, and apparent sizes, where it

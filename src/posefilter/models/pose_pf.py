@@ -9,6 +9,7 @@ from torch import Generator, Tensor, nn
 from posefilter.capabilities import Capabilities
 from posefilter.data.absent import hide_annotation
 from posefilter.filters.traces import map_tensors
+from posefilter.metrics.scores import InstanceErrors
 from posefilter.models.candidate_samplers import CandidateSampler
 from posefilter.models.pose_particles import PoseParticles, require_depth
 from posefilter.nets.coordinates import Cells, Coordinates, coordinate_loss
@@ -217,9 +218,11 @@ class PosePF(PoseParticles):
         sigma = pair.new_tensor(self.comparison_sigma)
         scores = self._score(encoding, pair, sigma, generator, self.comparison_pixels)
         outscored = known & (scores[:, 0] > scores[:, 1])
-        _, misplaced, diameter, error = self.scores["poses"].rows[-1].T  # of this batch
-        wrong = [outscored & (one > 0.1 * diameter) for one in (error, misplaced)]
-        for name, value in zip(_OUTSCORED, (outscored, *wrong), strict=True):
+        errors: InstanceErrors = self.scores["poses"].last()
+        limit = 0.1 * errors.diameter
+        wrong = outscored & (errors.add_up_to_symmetry > limit)
+        misplaced = outscored & (errors.add_s > limit)
+        for name, value in zip(_OUTSCORED, (outscored, wrong, misplaced), strict=True):
             self.scores[name].update(value.float())
 
     def compute_metrics(self) -> dict[str, Any]:
