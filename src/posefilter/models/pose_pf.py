@@ -209,7 +209,9 @@ class PosePF(PoseParticles):
         it.
         """
         super().update_metrics(trace, batch)
-        encoding = self.encode(hide_annotation(batch))
+        encoding = trace.encoding
+        if encoding is None:
+            encoding = self.encode(hide_annotation(batch))
         truth, best = batch.camera_from_object, trace.belief.best
         known = best.isfinite().flatten(1).all(1)  # any other is a miss
         best = torch.where(known[:, None, None], best, truth)
