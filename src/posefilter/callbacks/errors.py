@@ -16,6 +16,7 @@ from posefilter.metrics.beliefs import on_object
 from posefilter.metrics.image_errors import FILE, ImageError, write_errors
 from posefilter.metrics.scores import InstanceErrors
 from posefilter.models.base import PoseEstimator
+from posefilter.models.evaluation import last_assessment
 from posefilter.types import Batch, Trace
 
 
@@ -86,7 +87,7 @@ def measure_batch(
         belief = {"log_density": truth.log_density.tolist(), "credible_rank": truth.rank.tolist()}
     pixels = method.particle_pixels(trace.particles[-1], batch)
     seconds = method.seconds_per_image[-1] if method.seconds_per_image else math.nan
-    judged = method.last_assessment(count)
+    judged = last_assessment(method, count)
     return make_rows(
         records,
         batch,

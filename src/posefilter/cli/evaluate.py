@@ -42,6 +42,7 @@ from posefilter.metrics.image_errors import FILE as ERRORS
 from posefilter.metrics.image_errors import ImageError, write_errors
 from posefilter.metrics.results import compute_checkpoint_score
 from posefilter.models.base import PoseEstimator
+from posefilter.models.evaluation import judge_confidence
 from posefilter.paths import check_links, find_conf
 from posefilter.types import Batch, ObjectModel
 
@@ -161,7 +162,7 @@ def judge_absent(method: PoseEstimator, data: PoseDataModule, limit: int) -> Non
         for number, batch in enumerate(make_loader(frames, _BATCH, 0)):
             hidden = Batch(*(x.to(method.device) for x in hide_annotation(batch)))
             trace = method.predict_step(hidden, number)
-            method.judge_confidence(trace, hidden, present=False)
+            judge_confidence(method, trace, hidden, present=False)
 
 
 def _of_estimates(job: Job) -> tuple[dict[str, Any], dict[str, Path]]:

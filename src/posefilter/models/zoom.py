@@ -18,6 +18,7 @@ from torch import Generator, Tensor
 
 from posefilter.confidence.second_look import LEAST_DEPTH, measure_worth, read_objectness
 from posefilter.data.resize import resize_depth
+from posefilter.errors import UserError
 from posefilter.filters.loop import ParticleFilter
 from posefilter.filters.traces import map_traces
 from posefilter.geometry.camera import project, resize_intrinsics
@@ -43,6 +44,22 @@ def with_encoding(method: Any, encoding: Encoding) -> Any:
     vars(out).update(vars(method))  # with its trainer, which Lightning leaves out of copies
     out.encode = lambda batch: encoding
     return out
+
+
+def check_zoom(method: Any) -> None:
+    """Raise UserError where windows are asked of a method or a filter that cannot search them."""
+    if getattr(method.filter, "zoom_diameter", None) is None:
+        return
+    if "pose_space" not in method.capabilities:
+        raise UserError(
+            "filter.zoom_diameter: needs a method whose particles are poses, such as "
+            f"pose_pf; those of {type(method).__name__} are places in one image"
+        )
+    if type(method.filter).forward is not ParticleFilter.forward:
+        raise UserError(
+            f"filter.zoom_diameter: {type(method.filter).__name__} has a forward() of its "
+            "own, which windows would not run; choose null"
+        )
 
 
 def search(
