@@ -99,10 +99,10 @@ class ResampleMove:
         def score(poses: Tensor) -> Tensor:
             # the same image points each time: the target stays as it is
             fixed = torch.Generator(device).manual_seed(seed)
-            found = scorer_of(method).score_poses(
+            log_likelihood = scorer_of(method).score_poses(
                 encoding, poses.to(belief.poses), self.sigma, fixed, self.pixels
             )
-            return found.double() / self.temperature
+            return log_likelihood.double() / self.temperature
 
         strata = Systematic().uniforms(B, N, generator, device)
         poses = take_poses(belief.poses.double(), inverse_cdf(belief.log_weights, strata))

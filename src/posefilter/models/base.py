@@ -276,26 +276,27 @@ class PoseEstimator(Module):
         return self.calibration.assess(features, self.pose_tolerance)
 
     def calibrate_belief(
-        self, belief: BeliefBatch, found: Assessment | None
+        self, belief: BeliefBatch, assessment: Assessment | None
     ) -> tuple[BeliefBatch, Tensor | None]:
         """Return beliefs as wide as the errors of right estimates are (confidence/belief_scale.py).
 
         Args:
             belief: B beliefs, as the filter leaves them.
-            found: What `assess` says of them; where it is None, or the calibration knows no scale,
-                beliefs are returned as they are.
+            assessment: What `assess` says of them; where it is None, or the calibration knows no
+                scale, beliefs are returned as they are.
 
         Returns:
             The beliefs; and of each, how many of the first poses are draws about the estimate,
             (B,), None where they are as they were.
         """
-        if found is None or self.calibration is None or self.calibration.belief_scale is None:
+        if assessment is None or self.calibration is None or self.calibration.belief_scale is None:
             return belief, None
-        assert found.features is not None
-        right = self.calibration.assess(found.features).probability  # within the default tolerance
-        features = self.calibration.standardize(found.features)
+        features = assessment.features
+        assert features is not None
+        right = self.calibration.assess(features).probability  # within the default tolerance
+        standardized = self.calibration.standardize(features)
         scale = self.calibration.belief_scale
-        return calibrate_belief(belief, right, features, scale, self.object_model)
+        return calibrate_belief(belief, right, standardized, scale, self.object_model)
 
     # -- training ----------------------------------------------------------------------------------
 
