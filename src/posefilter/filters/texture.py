@@ -342,8 +342,8 @@ class TextureRotations:
         turns, first_tried = list_rotations(object_model)
         if len(first_tried) <= _MOST:
             return None
-        here = torch.eye(4).expand_as(best).to(best)
-        return self._rotate_finely(best, here, turns.to(best), encoding, object_model)
+        identity = torch.eye(4).expand_as(best).to(best)
+        return self._rotate_finely(best, identity, turns.to(best), encoding, object_model)
 
     def _score(
         self,

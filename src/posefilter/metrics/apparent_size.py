@@ -28,8 +28,8 @@ class ApparentSizes(Rows[ApparentSizeColumns]):
 
     def update(self, scale: Tensor, contradicts: Tensor) -> None:
         """Accumulate images; (B,) with NaN where nothing can be told, and (B,) bool."""
-        told = ~scale.isnan()
-        self.append(ApparentSizeColumns(scale[told].cpu(), contradicts[told].cpu()))
+        measured = ~scale.isnan()
+        self.append(ApparentSizeColumns(scale[measured].cpu(), contradicts[measured].cpu()))
 
     def compute(self) -> dict[str, Any] | None:
         """Return the numbers; None where no image tells."""

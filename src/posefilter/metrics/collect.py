@@ -81,12 +81,12 @@ class PoseErrors(Rows[InstanceErrors]):
             object_id: (B,) index into `models`; the only one if None.
         """
         ids = [0] * len(truth) if object_id is None else object_id.tolist()
-        good = poses.isfinite().flatten(1).all(1)
+        finite = poses.isfinite().flatten(1).all(1)
         missed = torch.full((4, len(truth)), torch.inf, dtype=torch.float64, device=truth.device)
         errors = InstanceErrors(*missed)
         for index in sorted(set(ids)):
             selected = torch.tensor([i == index for i in ids], device=truth.device)
-            measured = selected & good
+            measured = selected & finite
             model, tree = self.models[index], self.trees[index]
             a, b = poses[measured].double(), truth[measured].double()
             errors.add[measured] = add(a, b, model.points)

@@ -41,15 +41,16 @@ def score_truth(belief: BeliefBatch, truth: Tensor, object_model: ObjectModel) -
     """
     rows = []
     poses, log_weights = belief.poses.detach().cpu(), belief.log_weights.detach().cpu()
-    for own, own_weights, true in zip(poses, log_weights, truth.detach().cpu(), strict=True):
-        normalized = own_weights.double().log_softmax(0)
+    for particles, weights, true in zip(poses, log_weights, truth.detach().cpu(), strict=True):
+        normalized = weights.double().log_softmax(0)
         size = (float(object_model.radius), float(object_model.diameter))
         density = fit_density(
-            own, normalized, object_model.center.cpu(), *size, object_model.symmetries.cpu()
+            particles, normalized, object_model.center.cpu(), *size, object_model.symmetries.cpu()
         )
-        at_truth, at_own = log_density(density, true[None])[0], log_density_held_out(density)
+        at_truth = log_density(density, true[None])[0]
+        at_particles = log_density_held_out(density)
         weights = density.log_weights.exp()
-        rank, mean = weights @ (at_own > at_truth).double(), weights @ at_own
+        rank, mean = weights @ (at_particles > at_truth).double(), weights @ at_particles
         rows.append(torch.stack([at_truth, rank, mean - at_truth]))
     return TruthScores(*(torch.stack(rows) if rows else torch.zeros(0, 3)).double().T)
 
@@ -94,10 +95,10 @@ def trace_curves(rank: Tensor, visible: Tensor) -> dict[str, Any]:
     """
     quarters = []
     for low, high in QUARTERS:
-        own = lies_within(visible, low, high)
-        if bool(own.any()):
-            one = {"from": low, "to": high, "instances": int(own.sum())}
-            quarters.append({**one, "coverage": trace_curve(rank[own])})
+        inside = lies_within(visible, low, high)
+        if bool(inside.any()):
+            quarter = {"from": low, "to": high, "instances": int(inside.sum())}
+            quarters.append({**quarter, "coverage": trace_curve(rank[inside])})
     return {"levels": list(LEVELS), "all": trace_curve(rank), "quarters": quarters}
 
 

@@ -71,11 +71,11 @@ def parse_row(row: dict[str, str]) -> ImageError:
     if missing:
         raise ValueError(f"column {missing[0]} is missing")
     kinds = ImageError.__annotations__
-    made = ImageError(*(kinds[name](row[name]) for name in ImageError._fields))
-    for name, value in zip(ImageError._fields, made, strict=True):
+    error = ImageError(*(kinds[name](row[name]) for name in ImageError._fields))
+    for name, value in zip(ImageError._fields, error, strict=True):
         if isinstance(value, float) and MOST < abs(value) < math.inf:
             raise ValueError(f"{name}={value} cannot be computed with")
-    return made
+    return error
 
 
 def summarize_images(rows: Sequence[ImageError]) -> dict[str, dict[str, float]]:
