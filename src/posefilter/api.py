@@ -76,10 +76,10 @@ def load(
 def _list_overrides(overrides: Iterable[str], example: str) -> list[str]:
     """Return settings, of a generator too, as a list; raises UserError where one is no text."""
     listed = isinstance(overrides, Iterable) and not isinstance(overrides, str | Mapping)
-    found = [*overrides] if listed else []
-    if not listed or not all(isinstance(one, str) for one in found):
+    texts = [*overrides] if listed else []
+    if not listed or not all(isinstance(text, str) for text in texts):
         raise UserError(f"overrides={overrides!r}: must be a list, such as ['{example}']")
-    return found
+    return texts
 
 
 def check_overrides(overrides: Iterable[str]) -> list[str]:
@@ -88,16 +88,16 @@ def check_overrides(overrides: Iterable[str]) -> list[str]:
     Raises:
         UserError: They are no list of texts, or one sets what is not the filter's.
     """
-    found = _list_overrides(overrides, "filter.particles=1000")
-    for one in found:
-        key = key_of(one).split("@")[0]
+    texts = _list_overrides(overrides, "filter.particles=1000")
+    for override in texts:
+        key = key_of(override).split("@")[0]
         if not key.startswith(tuple(f"{section}{mark}" for section in SECTIONS for mark in "./")):
             instead = f": {_INSTEAD[key]}" if key in _INSTEAD else ""
             raise UserError(
-                f"overrides: '{one}' changes nothing of a trained filter{instead}; what does "
+                f"overrides: '{override}' changes nothing of a trained filter{instead}; what does "
                 "begins with filter or model, such as filter.particles=1000 or filter/refine=none"
             )
-    return found
+    return texts
 
 
 def compose(overrides: Sequence[str] = (), command: str = "train") -> DictConfig:
@@ -116,10 +116,10 @@ def compose(overrides: Sequence[str] = (), command: str = "train") -> DictConfig
         UserError: An override names what there is not, a choice of a training that does not fit
             the others, or a plug-in that is not trusted: see `trust`.
     """
-    found = _list_overrides(overrides, "model=patch_pf")
+    texts = _list_overrides(overrides, "model=patch_pf")
     from posefilter.cli.command import compose_config  # Hydra: `load` answers without it
 
-    return compose_config(command, found)
+    return compose_config(command, texts)
 
 
 def build(config: DictConfig, data: "PoseDataModule | None" = None) -> PoseEstimator:

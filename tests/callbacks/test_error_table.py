@@ -78,17 +78,15 @@ def test_errors_of_a_batch_are_in_its_order() -> None:
     errors = PoseErrors([object_model(0.2), object_model(0.4)])
     guess = shifted([0.01, float("nan"), 0.03, 0.02])
     errors.update(guess, shifted([0.0] * 4), torch.tensor([1, 0, 0, 1]))
-    add, _, diameter, _ = errors.rows[-1].T.tolist()
-    assert add == pytest.approx([0.01, math.inf, 0.03, 0.02], abs=1e-6)
-    assert diameter == pytest.approx([0.4, 0.2, 0.2, 0.4])
+    add, _, diameter, _ = errors.last()
+    assert add.tolist() == pytest.approx([0.01, math.inf, 0.03, 0.02], abs=1e-6)
+    assert diameter.tolist() == pytest.approx([0.4, 0.2, 0.2, 0.4])
 
 
 class Method(torch.nn.Module):
     """What the callback uses of a method."""
 
-    def last_assessment(self, count: int) -> Assessment:
-        """Return presence and probability."""
-        return Assessment(*torch.full((2, count), 0.5))
+    calibration = True
 
 
 @pytest.fixture
@@ -112,7 +110,12 @@ def tested(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[Path, PoseE
     method: Any = Method()
     method.object_model, method.capabilities = object_model(), {"pose"}
     at_truth = SimpleNamespace(log_density=torch.arange(3.0), rank=torch.full((3,), 0.5))
-    method.scores = {"poses": errors, "credibility": SimpleNamespace(last=lambda: at_truth)}
+    judged = Assessment(*torch.full((2, 3), 0.5))
+    method.scores = {
+        "poses": errors,
+        "credibility": SimpleNamespace(last=lambda: at_truth),
+        "confidence": SimpleNamespace(last=lambda: judged),
+    }
     method.seconds_per_image = [0.5]
     method.particle_pixels = lambda particles, batch: torch.full((len(batch.frame_id), 4, 2), 5.0)
     table = ErrorTable(tmp_path, best=2, worst=2)

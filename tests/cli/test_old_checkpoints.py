@@ -8,8 +8,8 @@ import pytest
 import torch
 
 from posefilter.cli.instantiate import accepted, instantiate_recipe, locate
+from posefilter.cli.old_names import ARGUMENTS, CLASSES
 from posefilter.cli.recipe import check_recipe
-from posefilter.cli.renamed import ARGUMENTS, CLASSES
 from posefilter.confidence.calibration import read_calibration
 from posefilter.errors import UserError
 

@@ -70,7 +70,7 @@ def test_the_last_scores_are_told_as_they_came() -> None:
     for start in (0.0, 0.5):
         rows = torch.tensor([[0.1, 0.2], [0.3, 0.4], [0.5, 0.6]]).double() + start
         metric.update(TruthScores(*rows), torch.ones(2))
-    assert torch.equal(torch.stack(list(metric.last())), rows)
+    assert torch.equal(torch.stack(list(metric.last())[:3]), rows)
 
 
 def test_scores_by_the_density_itself() -> None:

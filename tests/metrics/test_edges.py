@@ -36,7 +36,7 @@ from posefilter.metrics.diagnostics import (
     r2_score,
 )
 from posefilter.metrics.errors import add, add_up_to_symmetry
-from posefilter.metrics.image_errors import parse_row, read_errors, summarize_errors
+from posefilter.metrics.image_errors import parse_row, read_errors, summarize_images
 from posefilter.metrics.parts import PartIoU, label_pixels
 from posefilter.metrics.results import compute_checkpoint_score, flatten
 from posefilter.metrics.scores import auc, median, overall, recall
@@ -328,7 +328,7 @@ def test_older_tables_of_errors_have_fewer_columns(tmp_path: Path) -> None:
     assert read_errors(file)[0][:-5] == old[:-5]
     # errors of 5 and 15 mm of an object of 100 mm
     rows = [old._replace(add_mm=x, add_s_mm=x / 5, diameter_mm=100.0) for x in (5.0, 15.0)]
-    found = summarize_errors(rows)
+    found = summarize_images(rows)
     assert found["add"]["recall_01d"] == 50
     assert found["add"]["median_mm"] == pytest.approx(10)
     assert found["add_s"]["median_mm"] == pytest.approx(2)

@@ -26,6 +26,7 @@ from posefilter.metrics.confidence import Confidence
 from posefilter.metrics.credibility import Credibility, TruthScores
 from posefilter.metrics.diagnostics import FilterDiagnostics
 from posefilter.metrics.parts import PartIoU
+from posefilter.metrics.scores import InstanceErrors
 from posefilter.types import BeliefBatch, ParticleOutput, Particles, Step, Trace
 
 MODEL = square()
@@ -62,10 +63,10 @@ def belief_of(part: slice) -> BeliefBatch:
     return BeliefBatch(CLOUD[part], log_w, CLOUD[part, 0], log_w[:, 0])
 
 
-def measure(part: slice) -> torch.Tensor:
+def measure(part: slice) -> InstanceErrors:
     errors = PoseErrors([MODEL])
     errors.update(GUESS[part], TRUTH[part])
-    return errors.rows[0]
+    return errors.last()
 
 
 TRUTH, GUESS = BATCH.camera_from_object, CLOUD[:, 0]

@@ -5,12 +5,13 @@ from tests.models.toy import square
 
 from posefilter.geometry.pose import make_pose
 from posefilter.metrics.collect import ErrorsByVisibility, PoseErrors
+from posefilter.metrics.scores import InstanceErrors
 
 
-def measure(poses: torch.Tensor, truth: torch.Tensor) -> torch.Tensor:
+def measure(poses: torch.Tensor, truth: torch.Tensor) -> InstanceErrors:
     errors = PoseErrors([square()])
     errors.update(poses, truth)
-    return errors.rows[0]
+    return errors.last()
 
 
 def test_each_range_has_its_own_instances() -> None:

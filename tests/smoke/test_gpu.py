@@ -4,6 +4,7 @@ compared.
 
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -22,6 +23,7 @@ from posefilter.cli.train import look_once, train
 from posefilter.data.module import PoseDataModule
 from posefilter.filters.texture import TextureRotations
 from posefilter.images import check_images, make_batch
+from posefilter.models import evaluation
 from posefilter.models.base import PoseEstimator
 from posefilter.types import Batch, Trace
 
@@ -140,13 +142,14 @@ def test_probabilities_are_calibrated_and_evaluated(
     typed = [f"checkpoint={weights}", f"absent={without}", f"out={out}", *data, *QUIET]
     typed += ["data.split={train: 0, val: 1.0, test: 0}", "frames=12", "absent_frames=10"]
     devices: list[torch.device] = []
-    judge = PoseEstimator.judge_confidence
+    judge = evaluation.judge_confidence
 
-    def watch(self: PoseEstimator, trace: Trace, batch: Batch, present: bool = True) -> None:
+    def watch(method: PoseEstimator, trace: Trace, batch: Batch, present: bool) -> Any:
         devices.append(batch.rgb.device)
-        judge(self, trace, batch, present=present)
+        return judge(method, trace, batch, present)
 
-    monkeypatch.setattr(PoseEstimator, "judge_confidence", watch)
+    for module in ("posefilter.models.evaluation", "posefilter.cli.evaluate"):
+        monkeypatch.setattr(f"{module}.judge_confidence", watch)
     with simulate_gpu():
         assert run_command("calibrate", HOME, typed) == 0
         typed = [f"checkpoint={out}", *data, "data.split={test: 1.0}", *QUIET]

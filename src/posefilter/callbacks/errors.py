@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 
+import torch
 from lightning import LightningModule, Trainer
 
 from posefilter.callbacks.gallery import ImageSelection, draw_gallery, find_shape, keep_image
@@ -12,9 +13,10 @@ from posefilter.callbacks.tensorboard import post_image
 from posefilter.callbacks.trace_callback import TraceCallback
 from posefilter.data.frames import FrameRecord
 from posefilter.metrics.beliefs import on_object
-from posefilter.metrics.collect import PoseErrors
 from posefilter.metrics.image_errors import FILE, ImageError, write_errors
+from posefilter.metrics.scores import InstanceErrors
 from posefilter.models.base import PoseEstimator
+from posefilter.models.evaluation import last_assessment
 from posefilter.types import Batch, Trace
 
 
@@ -78,28 +80,48 @@ def measure_batch(
         records: The B frames.
     """
     count = len(records)
-    add, add_s, diameter, up_to_symmetry = [[math.nan] * count] * 4
+    errors = InstanceErrors(*torch.full((4, count), torch.nan))
+    belief: dict[str, Sequence[float]] = {}
     if "pose" in method.capabilities:
-        poses = method.scores["poses"]
-        assert isinstance(poses, PoseErrors)
-        add, add_s, diameter, up_to_symmetry = (1000 * poses.rows[-1]).T.tolist()
-    shares = on_object(batch.mask, method.particle_pixels(trace.particles[-1], batch)).tolist()
+        errors, truth = method.scores["poses"].last(), method.scores["credibility"].last()
+        belief = {"log_density": truth.log_density.tolist(), "credible_rank": truth.rank.tolist()}
+    pixels = method.particle_pixels(trace.particles[-1], batch)
     seconds = method.seconds_per_image[-1] if method.seconds_per_image else math.nan
-    scores, times = trace.belief.score.tolist(), [seconds] * count
-    judged = method.last_assessment(count)
-    found = [judged.presence.tolist(), judged.probability.tolist()]
-    if "pose" in method.capabilities:
-        at_truth = method.scores["credibility"].last()
-        found += [at_truth.log_density.tolist(), at_truth.rank.tolist(), up_to_symmetry]
-    return make_rows(records, batch, add, add_s, diameter, shares, scores, times, *found)
+    judged = last_assessment(method, count)
+    return make_rows(
+        records,
+        batch,
+        errors,
+        particles_on_object=on_object(batch.mask, pixels).tolist(),
+        score=trace.belief.score.tolist(),
+        seconds=[seconds] * count,
+        presence=judged.presence.tolist(),
+        probability=judged.probability.tolist(),
+        **belief,
+    )
 
 
 def make_rows(
-    records: Sequence[FrameRecord], batch: Batch, *columns: Sequence[float]
+    records: Sequence[FrameRecord],
+    batch: Batch,
+    errors: InstanceErrors,
+    **columns: Sequence[float],
 ) -> list[ImageError]:
-    """Return a row an image; columns: B numbers each, of the fields from `add_mm` on."""
-    seen = batch.visibility.tolist()
+    """Return a row an image.
+
+    Args:
+        records: The B frames.
+        batch: The B images.
+        errors: (B,) each [m].
+        **columns: Other fields of the rows, B numbers each.
+    """
+    for name, values in errors._asdict().items():
+        columns[f"{name}_mm"] = (1000 * values).tolist()
+    columns["visibility"] = batch.visibility.tolist()
+    numbers = zip(*columns.values(), strict=True)
     return [
-        ImageError(r.scene_id, r.im_id, r.obj_id, r.object, r.name, *numbers)
-        for r, *numbers in zip(records, seen, *columns, strict=True)
+        ImageError(
+            r.scene_id, r.im_id, r.obj_id, r.object, r.name, **dict(zip(columns, row, strict=True))
+        )
+        for r, row in zip(records, numbers, strict=True)
     ]

@@ -13,6 +13,7 @@ from posefilter.data.frames import FrameRecord
 from posefilter.files import open_whole
 from posefilter.metrics.bop_results import PoseRow, choose_score, to_native
 from posefilter.models.base import PoseEstimator
+from posefilter.models.evaluation import last_assessment
 from posefilter.types import Batch, BeliefBatch, Trace
 
 NativeFromMesh = Callable[[str], np.ndarray]
@@ -50,7 +51,7 @@ class Records(TraceCallback):
         """Take in one batch."""
         times = method.seconds_per_image
         seconds = times[-1] if times else math.nan
-        probabilities = method.last_assessment(len(batch.rgb)).probability.tolist()
+        probabilities = last_assessment(method, len(batch.rgb)).probability.tolist()
         assert method.last_belief is not None
         self.outcomes += collect_outcomes(method.last_belief, batch, seconds, probabilities)
 

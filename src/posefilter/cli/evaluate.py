@@ -42,6 +42,7 @@ from posefilter.metrics.image_errors import FILE as ERRORS
 from posefilter.metrics.image_errors import ImageError, write_errors
 from posefilter.metrics.results import compute_checkpoint_score
 from posefilter.models.base import PoseEstimator
+from posefilter.models.evaluation import judge_confidence
 from posefilter.paths import check_links, find_conf
 from posefilter.types import Batch, ObjectModel
 
@@ -161,7 +162,7 @@ def judge_absent(method: PoseEstimator, data: PoseDataModule, limit: int) -> Non
         for number, batch in enumerate(make_loader(frames, _BATCH, 0)):
             hidden = Batch(*(x.to(method.device) for x in hide_annotation(batch)))
             trace = method.predict_step(hidden, number)
-            method.judge_confidence(trace, hidden, present=False)
+            judge_confidence(method, trace, hidden, present=False)
 
 
 def _of_estimates(job: Job) -> tuple[dict[str, Any], dict[str, Path]]:
@@ -208,10 +209,15 @@ def _of_estimates(job: Job) -> tuple[dict[str, Any], dict[str, Path]]:
         bop.update(poses, batch.camera_from_object, batch.intrinsics, width, batch.object_id)
         scores = [nan if row is None else row.score for row in estimates]
         times = [nan if row is None or row.seconds < 0 else row.seconds for row in estimates]
-        *by_pose, up_to_symmetry = (1000 * errors.rows[-1]).T.tolist()
-        unknown = [nan] * len(own)  # particles, probabilities and beliefs
-        columns = (*by_pose, unknown, scores, times, *[unknown] * 4, up_to_symmetry)
-        table += make_rows(own, batch, *columns)
+        no_particles = [nan] * len(own)
+        table += make_rows(
+            own,
+            batch,
+            errors.last(),
+            particles_on_object=no_particles,
+            score=scores,
+            seconds=times,
+        )
         for i, index in enumerate(batch.object_id.tolist()):
             hull, K = errors.models[index].hull, batch.intrinsics[i : i + 1]
             truth = box_of_pose(batch.camera_from_object[i : i + 1], hull, K, height, width)

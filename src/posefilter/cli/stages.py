@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-from posefilter.cli.renamed import COMMANDS
+from posefilter.cli.old_names import COMMANDS
 from posefilter.cli.results import write_json
 from posefilter.errors import UserError
 from posefilter.forms import NUMBER, Each, Record, check_form, parse_json

@@ -160,7 +160,7 @@ def fit(run: Run) -> dict[str, Any]:
             raise UserError(
                 f"resume={start}: holds other networks than these settings ({first})"
             ) from error
-        if not isinstance(error, MisconfigurationException) and not _is_lightnings(error):
+        if not isinstance(error, MisconfigurationException) and not _raised_by_lightning(error):
             raise
         raise UserError(f"trainer or callbacks: {told}") from error
     taken = cost(run.trainer.global_step, before, *began)
@@ -210,14 +210,14 @@ def _check_epochs(trainer: Trainer, batches: int) -> None:
         )
 
 
-def _is_lightnings(error: Exception) -> bool:
-    """Tell whether Lightning's trainer or a callback of its own has raised an error itself, rather
-    than passed it on. A RuntimeError of the trainer may be a device's.
+def _raised_by_lightning(error: Exception) -> bool:
+    """Return whether Lightning's trainer or a callback of its own has raised an error itself,
+    rather than passed it on. A RuntimeError of the trainer may be a device's.
     """
+    packages = (callbacks,) if isinstance(error, RuntimeError) else (callbacks, loops)
+    folders = [Path(str(package.__file__)).parent for package in packages]
     frames = traceback.extract_tb(error.__traceback__)
-    places = [Path(str(one.__file__)).parent for one in (callbacks, loops)]
-    places = places[:1] if isinstance(error, RuntimeError) else places
-    return bool(frames) and any(Path(frames[-1].filename).is_relative_to(p) for p in places)
+    return bool(frames) and any(Path(frames[-1].filename).is_relative_to(at) for at in folders)
 
 
 def test(run: Run, checkpoint: dict[str, Any]) -> dict[str, Any]:

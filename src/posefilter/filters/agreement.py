@@ -71,13 +71,13 @@ class Agreement:
         assert isinstance(method, HasSurfacePoints)  # of what `requires` says
         object_model = method.object_model
         center, radius = object_model.center.to(particles.state), object_model.radius
-        point, known = method.surface_points(encoding, particles.state)
+        point, measured = method.surface_points(encoding, particles.state)
         share, position = self.list_object_points(output, point, center, radius)
-        weight = output.log_likelihood.detach().exp() * known
+        weight = output.log_likelihood.detach().exp() * measured
         votes = draw_votes(
             point, weight, share, position, center, radius, self.hypotheses, generator
         )
-        weight = weight + 1e-9  # where none is known, all are
+        weight = weight + 1e-9  # where none is measured, all count
         top = weight.topk(min(self.hypotheses, weight.shape[1]), dim=1).indices
         hypotheses = torch.cat([votes, take_poses(output.pose.detach(), top)], dim=1)
         object_point = center + radius * position

@@ -67,9 +67,9 @@ def sample_around_truth(
     size = torch.empty(B, per_kind, device=device).uniform_(low, high, generator=generator).exp()
     copies = truth.expand(B, per_kind, 4, 4)
     nearby = perturb(copies, size * 0.6, space, generator)
-    seen = batch.depth, batch.intrinsics, space, per_kind, generator
-    on_object = draw_from_depth(*seen, batch.mask.float() + 0.02)
-    anywhere = draw_from_depth(*seen)
+    arguments = batch.depth, batch.intrinsics, space, per_kind, generator
+    on_object = draw_from_depth(*arguments, batch.mask.float() + 0.02)
+    anywhere = draw_from_depth(*arguments)
     half = per_kind // 2
     shifted = perturb(truth.expand(B, half, 4, 4), size[:, :half] * 0.5, space, generator)
     any_rotation = random_rotation(B, half, generator=generator, device=device)

@@ -84,8 +84,9 @@ class Mean:
         generator: Generator,
     ) -> BeliefBatch:
         """Return the belief; differentiable in weights and poses."""
-        own = method.space
-        space = own if isinstance(own, PoseSpace) else PoseSpace((0.0, 0.0, 0.0), 1.0)
+        space = method.space
+        if not isinstance(space, PoseSpace):
+            space = PoseSpace((0.0, 0.0, 0.0), 1.0)
         weights = particles.log_weights.exp()
         weighted = torch.where(weights > 0, weights * output.log_likelihood, 0.0)
         mean = space.mean(output.pose, weights)
@@ -108,12 +109,12 @@ def kernel_mass(
         Log masses (B, N), at most 0.
     """
     rows = max(1, chunk // log_weights.numel())
-    parts = []
+    log_masses = []
     for block in state.split(rows, dim=1):
         distance = space.distance(block[:, :, None], state[:, None])
         log_kernel = -0.5 * (distance / bandwidth).square()
-        parts.append((log_weights[:, None] + log_kernel).logsumexp(2))
-    return torch.cat(parts, dim=1)
+        log_masses.append((log_weights[:, None] + log_kernel).logsumexp(2))
+    return torch.cat(log_masses, dim=1)
 
 
 class DensestMode(BestParticle):

@@ -83,33 +83,33 @@ class PointToPlaneIcp:
         first = belief.best
         space = PoseSpace(tuple(object_model.center.tolist()), object_model.radius)
         center = object_model.center.to(first)
-        own = self.choose_points(object_model.points).to(first)
+        surface = self.choose_points(object_model.points).to(first)
         precision = space.noise_scale(first.new_tensor(self.prior)).double().pow(-2).diag()
-        pose, known = first, torch.zeros(len(first), dtype=torch.bool, device=first.device)
+        pose, paired = first, torch.zeros(len(first), dtype=torch.bool, device=first.device)
         moved = first.new_zeros(len(first), 6, 1, dtype=torch.float64)
         for index in range(self.iterations):
             part = index / max(self.iterations - 1, 1)
             width = self.initial_gate * (self.final_gate / self.initial_gate) ** part
-            information, slope, known = self.measure(pose, own, center, encoding, width)
+            information, slope, paired = self.measure(pose, surface, center, encoding, width)
             slope = slope[..., None] - precision @ moved
-            step = torch.linalg.solve(information + precision, slope) * known[:, None, None]
+            step = torch.linalg.solve(information + precision, slope) * paired[:, None, None]
             # for turns as small as these, twists add up
             pose, moved = space.move(pose, step[..., 0].to(pose)), moved + step
         # without enough points in the last step what was paired before was something else
-        return belief._replace(best=torch.where(known[:, None, None], pose, first))
+        return belief._replace(best=torch.where(paired[:, None, None], pose, first))
 
     def choose_points(self, points: Tensor) -> Tensor:
         """Return every so many of an object's surface points.  (P, 3) -> (`points` at most, 3)."""
         return points[:: -(-len(points) // self.points)]
 
     def measure(
-        self, pose: Tensor, own: Tensor, center: Tensor, encoding: HasDepth, width: float
+        self, pose: Tensor, surface: Tensor, center: Tensor, encoding: HasDepth, width: float
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Return what the depth says of a pose's twist.
 
         Args:
             pose: (B, 4, 4) camera_from_object [m].
-            own: (P, 3) surface points [m].
+            surface: (P, 3) points of the object [m].
             center: (3,) the object's center [m].
             encoding: Depth and camera.
             width: Of the loss [m].
@@ -118,14 +118,14 @@ class PointToPlaneIcp:
             The normal equations of a Gauss-Newton step: matrices (B, 6, 6) and right sides (B, 6),
             in float64; and whether enough points were paired, (B,).
         """
-        rows, offsets, weights = self._pair(pose, own, center, encoding, width)
+        rows, offsets, weights = self._pair(pose, surface, center, encoding, width)
         total = weights.sum(-1)
         share = (self.effective / total.clamp_min(_FEW)).clamp_max(1) / self.noise**2
         weighted = rows.mT * (weights * share[:, None])[:, None]
         return weighted @ rows, (weighted @ offsets[..., None])[..., 0], total > _FEW
 
     def _pair(
-        self, pose: Tensor, own: Tensor, center: Tensor, encoding: HasDepth, width: float
+        self, pose: Tensor, surface: Tensor, center: Tensor, encoding: HasDepth, width: float
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Pair surface points with what is measured at their pixels; arguments as of `measure`.
 
@@ -133,20 +133,20 @@ class PointToPlaneIcp:
             Derivatives (B, P, 6) of each point's place along the measured normal by the twist, how
             far it has to go (B, P) [m], and its weight (B, P); in float64.
         """
-        points, middle = transform(pose, own), origin_of(pose, center)[:, None]
+        points, middle = transform(pose, surface), origin_of(pose, center)[:, None]
         ahead = points[..., 2] > _NEAREST
         pixels = nearest_pixel(project(points, encoding.intrinsics))
-        seen = look_up(encoding.measured_depth, encoding.intrinsics, pixels)
+        measured = look_up(encoding.measured_depth, encoding.intrinsics, pixels)
         view = torch.nn.functional.normalize(points, dim=-1)
         facing = ((points - middle) * view).sum(-1) < 0
-        frontal = (seen.normals * view).sum(-1) < -_GRAZING
-        way = seen.points - points
-        near = way.norm(dim=-1) < _FAR * width
-        along = (way * seen.normals).sum(-1)
+        frontal = (measured.normals * view).sum(-1) < -_GRAZING
+        offset = measured.points - points
+        near = offset.norm(dim=-1) < _FAR * width
+        along = (offset * measured.normals).sum(-1)
         tukey = (1 - (along / width).square()).clamp_min(0).square()
-        counted = seen.known & ahead & facing & frontal & near
-        turn = torch.linalg.cross(points - middle, seen.normals) @ rotation_of(pose)
-        rows = torch.cat([seen.normals, turn], dim=-1)
+        counted = measured.known & ahead & facing & frontal & near
+        turn = torch.linalg.cross(points - middle, measured.normals) @ rotation_of(pose)
+        rows = torch.cat([measured.normals, turn], dim=-1)
         return rows.double(), along.double(), (tukey * counted).double()
 
 

@@ -99,11 +99,11 @@ class ImportanceSampling:
         assert isinstance(space, PoseSpace)  # of what `requires` says
         center = poses.new_tensor(space.center)
         drawn, log_q = [], []
-        for own, weights in zip(poses, log_weights, strict=True):
+        for particles, weights in zip(poses, log_weights, strict=True):
             # of a density's background alone the diameter counts: twice the radius will do
             diameter = 2 * space.radius
-            member = find_pose_modes(own, weights, space, diameter).member
-            density = fit_density(own, weights, center, space.radius, diameter, member=member)
+            member = find_pose_modes(particles, weights, space, diameter).member
+            density = fit_density(particles, weights, center, space.radius, diameter, member=member)
             density = widen(density, widening)
             drawn.append(draw_poses(density, self.samples, generator))
             log_q.append(log_density(density, drawn[-1]))

@@ -96,8 +96,14 @@ class FromDepth:
         """Return (B, N, 4, 4) [m]."""
         space = method.space
         assert isinstance(space, PoseSpace)  # of what `requires` says
-        seen, offset = (batch.depth, batch.intrinsics), self.depth_offset
-        return draw_from_depth(*seen, space, particles, generator, depth_offset=offset)
+        return draw_from_depth(
+            batch.depth,
+            batch.intrinsics,
+            space,
+            particles,
+            generator,
+            depth_offset=self.depth_offset,
+        )
 
 
 class FromObjectness:

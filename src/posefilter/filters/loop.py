@@ -81,8 +81,11 @@ class ParticleFilter(nn.Module):
             (confidence/second_look.py); 1 to 4.
         zoom_diameter: Where the object is smaller in the image, in widths of the image, a method
             that estimates poses searches a magnified window in which it has this diameter
-            (models/zoom.py); None: nowhere. The filter itself runs on the images that it is given:
-            `PoseEstimator.search` chooses them, in validation, test and prediction.
+            (models/zoom.py); None: nowhere.
+
+    The filter does not read the last two: it runs once, on the images that it is given. They say
+    how often, and on which windows, `PoseEstimator` runs it in validation, test and prediction.
+    They are arguments of the filter since the recipes of checkpoints hold them with its own.
 
     Raises:
         UserError: A number is below 1, `max_searches` above 4, or `zoom_diameter` not in (0, 1].
@@ -125,8 +128,8 @@ class ParticleFilter(nn.Module):
     def score_is(self) -> str:
         """What the belief's score is, in words: as the refinement says, or else the estimate."""
         for component in (self.refine, self.estimate):
-            if said := getattr(component, "score_is", ""):
-                return str(said)
+            if description := getattr(component, "score_is", ""):
+                return str(description)
         return f"as {type(self.estimate).__name__} defines it"
 
     def forward(self, batch: Batch, method: Method, generator: Generator) -> Trace:

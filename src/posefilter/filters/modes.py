@@ -77,10 +77,10 @@ def _find_leaders(state: Tensor, space: Space, max_distance: float, chunk: int =
     Particles are sorted by falling density, so only earlier ones are candidates.
     """
     index = torch.arange(len(state), device=state.device)
-    parts = []
+    leaders = []
     for block in index.split(max(1, chunk // len(state))):
         distance = space.distance(state[block][:, None], state[None])
         distance = distance.masked_fill(index[None] >= block[:, None], torch.inf)
         shortest, nearest = distance.min(1)
-        parts.append(torch.where(shortest <= max_distance, nearest, block))
-    return torch.cat(parts)
+        leaders.append(torch.where(shortest <= max_distance, nearest, block))
+    return torch.cat(leaders)

@@ -38,8 +38,8 @@ class Compose:
     @property
     def score_is(self) -> str:
         """What the last refinement that scores anew says; empty where none does."""
-        said = [getattr(one, "score_is", "") for one in self.components]
-        return next(filter(None, reversed(said)), "")
+        descriptions = [getattr(component, "score_is", "") for component in self.components]
+        return next(filter(None, reversed(descriptions)), "")
 
     def __call__(
         self, belief: BeliefBatch, encoding: Encoding, method: Method, generator: Generator

@@ -31,8 +31,8 @@ def inverse_cdf(log_weights: Tensor, uniforms: Tensor) -> Tensor:
     """
     sums = log_weights.detach().double().exp().cumsum(1)
     uniforms = uniforms.double() * sums[:, -1:]
-    found = torch.searchsorted(sums, uniforms.clamp_max(sums[:, -1:] * (1 - 1e-15)), right=True)
-    return found.clamp_max(log_weights.shape[1] - 1)
+    ancestors = torch.searchsorted(sums, uniforms.clamp_max(sums[:, -1:] * (1 - 1e-15)), right=True)
+    return ancestors.clamp_max(log_weights.shape[1] - 1)
 
 
 class InverseCDF:
@@ -164,13 +164,13 @@ class AdaptiveResampling:
         if count != M:
             return new
         low = (effective_sample_size(particles.log_weights) < self.threshold * M)[:, None]
-        kept = NoResampling()(particles, count, space, generator)
+        unchanged = NoResampling()(particles, count, space, generator)
         mixture_weights = new.mixture_weights
         if mixture_weights is not None:
             itself = torch.eye(M).to(mixture_weights)
             mixture_weights = torch.where(low[..., None], mixture_weights, itself)
-        ancestors = torch.where(low, new.ancestors, kept.ancestors)
-        log_weights = torch.where(low, new.log_weights, kept.log_weights)
+        ancestors = torch.where(low, new.ancestors, unchanged.ancestors)
+        log_weights = torch.where(low, new.log_weights, unchanged.log_weights)
         return Resampled(ancestors, log_weights, mixture_weights)
 
 
@@ -208,13 +208,17 @@ class Islands:
         islands = max(n for n in range(1, most + 1) if not (M % n or count % n))
         log_w = particles.log_weights.reshape(B * islands, M // islands)
         log_island = log_w.logsumexp(1, keepdim=True)
-        own = Particles(*(x.reshape(B * islands, M // islands, *x.shape[2:]) for x in particles))
+        by_island = Particles(
+            *(x.reshape(B * islands, M // islands, *x.shape[2:]) for x in particles)
+        )
         # of an island without weight any particle will do
-        own = own._replace(log_weights=(log_w - log_island).nan_to_num(0.0).log_softmax(1))
-        new = self.resampler(own, count // islands, space, generator)
-        if new.mixture_weights is not None:
+        by_island = by_island._replace(
+            log_weights=(log_w - log_island).nan_to_num(0.0).log_softmax(1)
+        )
+        resampled = self.resampler(by_island, count // islands, space, generator)
+        if resampled.mixture_weights is not None:
             raise UserError("filter/resample=islands needs a scheme that draws ancestors")
         first = torch.arange(islands, device=log_w.device)[:, None] * (M // islands)
-        ancestors = new.ancestors.view(B, islands, -1) + first
-        log_weights = (new.log_weights + log_island).view(B, count)
+        ancestors = resampled.ancestors.view(B, islands, -1) + first
+        log_weights = (resampled.log_weights + log_island).view(B, count)
         return Resampled(ancestors.flatten(1), log_weights)

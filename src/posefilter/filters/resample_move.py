@@ -99,10 +99,10 @@ class ResampleMove:
         def score(poses: Tensor) -> Tensor:
             # the same image points each time: the target stays as it is
             fixed = torch.Generator(device).manual_seed(seed)
-            found = scorer_of(method).score_poses(
+            log_likelihood = scorer_of(method).score_poses(
                 encoding, poses.to(belief.poses), self.sigma, fixed, self.pixels
             )
-            return found.double() / self.temperature
+            return log_likelihood.double() / self.temperature
 
         strata = Systematic().uniforms(B, N, generator, device)
         poses = take_poses(belief.poses.double(), inverse_cdf(belief.log_weights, strata))
@@ -128,15 +128,15 @@ class ResampleMove:
         order = torch.rand(log_target.shape, generator=generator, device=poses.device).argsort(1)
         poses, log_target = take_poses(poses, order), log_target.gather(1, order)
         half = poses.shape[1] // 2
-        for own, others in ((slice(half), slice(half, None)), (slice(half, None), slice(half))):
-            if not log_target[:, own].numel():  # the first half of one particle
+        for moving, fixed in ((slice(half), slice(half, None)), (slice(half, None), slice(half))):
+            if not log_target[:, moving].numel():  # the first half of one particle
                 continue
-            proposed = self.propose(poses[:, own], poses[:, others], space, generator)
-            new, old = score(proposed), log_target[:, own]
+            proposed = self.propose(poses[:, moving], poses[:, fixed], space, generator)
+            new, old = score(proposed), log_target[:, moving]
             chance = torch.rand(old.shape, generator=generator, device=old.device, dtype=old.dtype)
             accept = chance.log() < new - old
-            poses[:, own] = torch.where(accept[..., None, None], proposed, poses[:, own])
-            log_target[:, own] = torch.where(accept, new, old)
+            poses[:, moving] = torch.where(accept[..., None, None], proposed, poses[:, moving])
+            log_target[:, moving] = torch.where(accept, new, old)
         return poses, log_target
 
     def propose(

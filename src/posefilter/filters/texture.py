@@ -81,11 +81,11 @@ def measure_texture(
     Raises:
         UserError: The object has no texture.
     """
-    own = read_print(object_model, poses)
+    texture = read_print(object_model, poses)
     images = zip(
         poses, encoding.measured_color, encoding.measured_depth, encoding.intrinsics, strict=True
     )
-    return torch.stack([_compare(*image, own, object_model, shift) for image in images])
+    return torch.stack([_compare(*image, texture, object_model, shift) for image in images])
 
 
 def read_print(object_model: ObjectModel, like: Tensor | None = None) -> Print:
@@ -109,11 +109,11 @@ def coarsen_texture(object_model: ObjectModel, most: int = _COARSE) -> ObjectMod
     texture = object_model.texture
     if texture is None or len(texture) <= most:
         return object_model
-    kept = _COARSENED.setdefault(texture, {})
-    if most not in kept:
+    by_count = _COARSENED.setdefault(texture, {})
+    if most not in by_count:
         # a point on the other side of a thin wall is not near
-        kept[most] = _average(texture, most, _WALL * object_model.diameter)
-    return object_model._replace(texture=kept[most])
+        by_count[most] = _average(texture, most, _WALL * object_model.diameter)
+    return object_model._replace(texture=by_count[most])
 
 
 def _average(texture: Tensor, most: int, side: float) -> Tensor:
@@ -143,22 +143,23 @@ def _compare(
     color: Tensor,
     depth: Tensor,
     K: Tensor,
-    own: Print,
+    texture: Print,
     object_model: ObjectModel,
     shift: float,
 ) -> Tensor:
     """Return the ratios of poses in one image.  (C, 4, 4), (3, H, W), (H, W), (3, 3) -> (C,)."""
-    points, normals, cosine, pixels, seen = look_at_print(poses, depth, K, own, object_model)
+    points, normals, cosine, pixels, seen = look_at_print(poses, depth, K, texture, object_model)
     weights = seen * cosine
     focal = float(K[0, 0])
-    covered = (weights * (own.spacing * focal / points[..., 2].clamp_min(0.05)).square()).sum(-1)
+    spacing = texture.spacing * focal / points[..., 2].clamp_min(0.05)  # [px]
+    covered = (weights * spacing.square()).sum(-1)
     count = _INDEPENDENT * torch.minimum(seen.sum(-1), covered / _PIXELS)
     basis = torch.cat([torch.ones_like(cosine)[..., None], normals], dim=-1)
     if not bool(seen.any()):
         return torch.zeros_like(count)
-    x = remove_linear(own.color.expand_as(points), basis, weights)
+    x = remove_linear(texture.color.expand_as(points), basis, weights)
     middle = float(origin_of(poses, object_model.center.to(poses))[:, 2].median().clamp_min(0.05))
-    sigma, step = choose_blur(own, focal, middle), shift * focal
+    sigma, step = choose_blur(texture, focal, middle), shift * focal
     image, corner = blur_around(color, pixels[seen], sigma, step)
     offsets = torch.cartesian_prod(*2 * [pixels.new_tensor([-step, 0, step] if step else [0])])
     moved = (pixels - corner)[:, :, None] + offsets.reshape(-1, 2)  # (C, P, S, 2)
@@ -179,7 +180,7 @@ class View(NamedTuple):
 
 
 def look_at_print(
-    poses: Tensor, depth: Tensor, K: Tensor, own: Print, object_model: ObjectModel
+    poses: Tensor, depth: Tensor, K: Tensor, texture: Print, object_model: ObjectModel
 ) -> View:
     """Return where textured points are, and which of them an image shows.
 
@@ -187,11 +188,11 @@ def look_at_print(
         poses: (C, 4, 4) camera_from_object [m].
         depth: (H, W) of the image [m].
         K: (3, 3) of its camera.
-        own: The object's textured points.
+        texture: The object's textured points.
         object_model: The object.
     """
-    points = transform(poses, own.points)
-    normals = own.normals @ rotation_of(poses).mT
+    points = transform(poses, texture.points)
+    normals = texture.normals @ rotation_of(poses).mT
     cosine = -(normals * F.normalize(points, dim=-1)).sum(-1)
     pixels = project(points, K)
     at = nearest_pixel(pixels).flatten(0, 1)
@@ -200,15 +201,15 @@ def look_at_print(
     return View(points, normals, cosine, pixels, (z > 0) & near & (cosine > _GRAZING))
 
 
-def choose_blur(own: Print, focal: float, distance: float) -> float:
+def choose_blur(texture: Print, focal: float, distance: float) -> float:
     """Return the blur that an image needs to be compared with textured points [px].
 
     Args:
-        own: The points.
+        texture: The points.
         focal: Focal length [px].
         distance: Of the object [m].
     """
-    return max(_SHARPEST, _BLUR * own.spacing * focal / distance)
+    return max(_SHARPEST, _BLUR * texture.spacing * focal / distance)
 
 
 def blur_around(
@@ -242,7 +243,7 @@ def _correlate(x: Tensor, y: Tensor, weights: Tensor) -> Tensor:
     (C, P, 1, 3), (C, P, S, 3), (C, P) -> (C, S).
     """
     weights = weights[..., None, None]
-    xy, xx, yy = ((weights * one).sum((1, 3)) for one in (x * y, x * x, y * y))
+    xy, xx, yy = ((weights * product).sum((1, 3)) for product in (x * y, x * x, y * y))
     return xy / (xx * yy).sqrt().clamp_min(1e-9)
 
 
@@ -341,8 +342,8 @@ class TextureRotations:
         turns, first_tried = list_rotations(object_model)
         if len(first_tried) <= _MOST:
             return None
-        here = torch.eye(4).expand_as(best).to(best)
-        return self._rotate_finely(best, here, turns.to(best), encoding, object_model)
+        identity = torch.eye(4).expand_as(best).to(best)
+        return self._rotate_finely(best, identity, turns.to(best), encoding, object_model)
 
     def _score(
         self,
@@ -436,13 +437,13 @@ def list_rotations(object_model: ObjectModel) -> tuple[Tensor, Tensor]:
     turns = object_model.shape_symmetries
     if object_model.texture is None or turns is None:
         raise UserError(_MISSING.format(name=object_model.name))
-    apart, kept = _angles(turns, turns) > _APART - 0.1, []
-    free = torch.ones_like(apart[0])  # of those that are kept already
+    apart, chosen = _angles(turns, turns) > _APART - 0.1, []
+    free = torch.ones_like(apart[0])  # of those that are chosen already
     while free.any():
-        kept.append(int(free.int().argmax()))  # the first
-        free &= apart[:, kept[-1]]
-        free[kept[-1]] = False
-    return turns, torch.tensor(kept, device=turns.device)
+        chosen.append(int(free.int().argmax()))  # the first
+        free &= apart[:, chosen[-1]]
+        free[chosen[-1]] = False
+    return turns, torch.tensor(chosen, device=turns.device)
 
 
 def _angles(a: Tensor, b: Tensor) -> Tensor:

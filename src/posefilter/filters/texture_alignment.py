@@ -121,30 +121,30 @@ class TextureAlignment:
         """
         object_model = object_of(method)
         first = belief.best
-        own = read_print(object_model, first)
+        texture = read_print(object_model, first)
         space = PoseSpace(tuple(object_model.center.tolist()), object_model.radius)
         precision = space.noise_scale(first.new_tensor(self.prior)).double().pow(-2).diag()
         surface = self.depth.choose_points(object_model.points).to(first)
-        sides = find_sides(own.normals)
-        seen = (encoding.measured_color, encoding.measured_depth, encoding.intrinsics)
-        pose, known = first, torch.zeros(len(first), dtype=torch.bool, device=first.device)
+        sides = find_sides(texture.normals)
+        images = (encoding.measured_color, encoding.measured_depth, encoding.intrinsics)
+        pose, compared = first, torch.zeros(len(first), dtype=torch.bool, device=first.device)
         moved = first.new_zeros(len(first), 6, dtype=torch.float64)
         for index in range(self.iterations):
             blur = self.initial_blur ** (1 - (index + 1) / self.iterations)
             information, slope, _ = self.depth.measure(
                 pose, surface, object_model.center.to(first), encoding, self.gate
             )
-            for row, image in enumerate(zip(*seen, strict=True)):
-                term = self._compare(pose[row], *image, own, sides, object_model, blur)
-                known[row] = term is not None
+            for row, image in enumerate(zip(*images, strict=True)):
+                term = self._compare(pose[row], *image, texture, sides, object_model, blur)
+                compared[row] = term is not None
                 if term is not None:
                     information[row] += term.information
                     slope[row] += term.slope
             step = torch.linalg.solve(information + precision, slope - moved @ precision)
             pose, moved = space.move(pose, step.to(pose)), moved + step
-        both = torch.stack([first, pose], dim=1)
-        fits = measure_texture(both, encoding, object_model, shift=0)
-        better = known & (fits[:, 1] - fits[:, 0] > self.min_gain)
+        poses = torch.stack([first, pose], dim=1)
+        fits = measure_texture(poses, encoding, object_model, shift=0)
+        better = compared & (fits[:, 1] - fits[:, 0] > self.min_gain)
         return belief._replace(best=torch.where(better[:, None, None], pose, first))
 
     def _compare(
@@ -153,7 +153,7 @@ class TextureAlignment:
         color: Tensor,
         depth: Tensor,
         K: Tensor,
-        own: Print,
+        texture: Print,
         sides: Tensor,
         object_model: ObjectModel,
         blur: float,
@@ -165,13 +165,13 @@ class TextureAlignment:
             color: (3, H, W) of the image.
             depth: (H, W) of the image [m].
             K: (3, 3) of its camera [px].
-            own: The object's textured points.
+            texture: The object's textured points.
             sides: (P,) which side each is on.
             object_model: The object.
             blur: Of the image, in units of what suits the textured points' distance.
         """
         focal = float(K[0, 0])
-        view = look_at_print(pose[None], depth, K, own, object_model)
+        view = look_at_print(pose[None], depth, K, texture, object_model)
         size = view.pixels.new_tensor(color.shape[:0:-1])  # width, height
         inside = (view.pixels > _RIM) & (view.pixels < size - 1 - _RIM)
         seen = (view.seen & inside.all(-1))[0]
@@ -179,10 +179,10 @@ class TextureAlignment:
             return None
         points, normals, cosine, pixels = (part[0, seen] for part in view[:4])
         center = origin_of(pose[None], object_model.center.to(pose))[0]
-        sigma = blur * choose_blur(own, focal, float(center[2]))
+        sigma = blur * choose_blur(texture, focal, float(center[2]))
         y, along = _look_up(color, pixels, sigma)
         basis = torch.cat([torch.ones_like(cosine)[:, None], normals], dim=-1)
-        x, y, weights, gain = _fit(own.color[seen], y, basis, cosine)
+        x, y, weights, gain = _fit(texture.color[seen], y, basis, cosine)
         power = weights[:, None] * x
         correlation = (power * y).sum() / ((power * x).sum() * _square(y, weights)).sqrt()
         if not float(correlation) > self.min_correlation:
@@ -197,7 +197,7 @@ class TextureAlignment:
         rows = rows - x[..., None].double() * share
         residual = (y - gain * x).double()
         variance = _square(residual, weights) / (3 * weights.double().sum())
-        covered = float((weights * (own.spacing * focal / points[:, 2]).square()).sum())
+        covered = float((weights * (texture.spacing * focal / points[:, 2]).square()).sum())
         count = min(len(x), covered / (_PIXELS * max(1.0, sigma**2)))
         scale = self.independent * count / len(x) / variance.clamp_min(_LEAST_NOISE**2)
         weighted = rows * weights[:, None, None].double()
@@ -205,9 +205,9 @@ class TextureAlignment:
         slope = -scale * torch.einsum("ncd,nc->d", weighted, residual)
         # the shifts of the sides are eliminated
         prior = torch.eye(3 * _SIDES, dtype=rows.dtype, device=rows.device) / self.texture_error**2
-        both = information[6:, :6]
-        part = torch.linalg.solve(information[6:, 6:] + prior, both).mT
-        return Term(information[:6, :6] - part @ both, slope[:6] - part @ slope[6:])
+        cross = information[6:, :6]
+        explained = torch.linalg.solve(information[6:, 6:] + prior, cross).mT
+        return Term(information[:6, :6] - explained @ cross, slope[:6] - explained @ slope[6:])
 
 
 def find_sides(normals: Tensor) -> Tensor:
@@ -220,7 +220,7 @@ def find_sides(normals: Tensor) -> Tensor:
 
 
 def _fit(
-    color: Tensor, seen: Tensor, basis: Tensor, weights: Tensor
+    color: Tensor, observed: Tensor, basis: Tensor, weights: Tensor
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Return the colors of object and image without shading, the points' robust weights, and the
     gain between them.
@@ -229,8 +229,8 @@ def _fit(
     """
     plain = weights
     for last in reversed(range(_REWEIGHTED)):
-        both = torch.cat([color, seen], dim=1)
-        x, y = remove_linear(both[None], basis[None], weights[None])[0].chunk(2, dim=1)
+        colors = torch.cat([color, observed], dim=1)
+        x, y = remove_linear(colors[None], basis[None], weights[None])[0].chunk(2, dim=1)
         power = weights[:, None] * x
         gain = (power * y).sum() / (power * x).sum().clamp_min(1e-12)
         if not last:
@@ -271,8 +271,8 @@ def _look_up(color: Tensor, pixels: Tensor, sigma: float) -> tuple[Tensor, Tenso
     steps = pixels.new_tensor([[0, 0], [-_HALF, 0], [_HALF, 0], [0, -_HALF], [0, _HALF]])
     at = (pixels - corner)[None] + steps[:, None]
     values = sample((image + DARK).log()[None], at.flatten(0, 1)[None])[0].unflatten(0, (5, -1))
-    here, left, right, above, below = values
-    return here, torch.stack([right - left, below - above], dim=-1) / (2 * _HALF)
+    middle, left, right, above, below = values
+    return middle, torch.stack([right - left, below - above], dim=-1) / (2 * _HALF)
 
 
 def pixel_derivatives(points: Tensor, arms: Tensor, pose: Tensor, K: Tensor) -> Tensor:

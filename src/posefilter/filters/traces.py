@@ -8,22 +8,22 @@ from torch import Tensor
 from posefilter.types import Trace
 
 
-def map_tensors(change: Callable[..., Tensor], *parts: Any) -> Any:
+def map_tensors(change: Callable[..., Tensor], *values: Any) -> Any:
     """Return nested tuples each of whose tensors is made of the same one of all that are given.
 
     What belongs to no image, a number or a tensor of no dimension, stays as the first has it.
 
     Args:
         change: Given a tensor of each, images first.
-        parts: Tuples of one form.
+        *values: Tuples of one form.
     """
-    one = parts[0]
-    if isinstance(one, Tensor):
-        return one if one.dim() == 0 else change(*parts)
-    if isinstance(one, tuple):
-        made = [map_tensors(change, *same) for same in zip(*parts, strict=True)]
-        return type(one)(*made) if hasattr(one, "_fields") else tuple(made)
-    return one
+    first = values[0]
+    if isinstance(first, Tensor):
+        return first if first.dim() == 0 else change(*values)
+    if isinstance(first, tuple):
+        fields = [map_tensors(change, *field) for field in zip(*values, strict=True)]
+        return type(first)(*fields) if hasattr(first, "_fields") else tuple(fields)
+    return first
 
 
 def map_traces(change: Callable[..., Tensor], *traces: Trace) -> Trace:

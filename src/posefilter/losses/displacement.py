@@ -61,9 +61,9 @@ class Chamfer:
     def __call__(self, trace: Trace, batch: Batch, object_model: ObjectModel) -> Tensor:
         """Return (B,)."""
         positions = displaced_positions(trace).transpose(0, 1).flatten(1, 2)
-        there = self.patch_to_mask(positions, batch.mask)
-        back = self.mask_to_patch(positions, batch.mask)
-        return (there + back) / batch.rgb.shape[-1] ** 2
+        to_mask = self.patch_to_mask(positions, batch.mask)
+        to_patch = self.mask_to_patch(positions, batch.mask)
+        return (to_mask + to_patch) / batch.rgb.shape[-1] ** 2
 
     def patch_to_mask(self, positions: Tensor, mask: Tensor) -> Tensor:
         """Return the mean squared distance of each patch pixel to its nearest mask pixel.

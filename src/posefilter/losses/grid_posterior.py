@@ -21,9 +21,9 @@ def squared_distances(
     (B, C, 3) [m], (M, 3, 3), (B, 4, 4) -> (B, C, M) [m^2].
     """
     shift = (centers - origin_of(truth, object_model.center.to(truth))[:, None]).square().sum(-1)
-    seen = look_at(centers).mT @ rotation_of(truth)[:, None]
-    alike = seen[:, :, None] @ rotation_of(object_model.symmetries.to(truth))
-    trace = torch.einsum("bcsij,mij->bcsm", alike, rotations).amax(2)
+    rotation = look_at(centers).mT @ rotation_of(truth)[:, None]
+    equivalent = rotation[:, :, None] @ rotation_of(object_model.symmetries.to(truth))
+    trace = torch.einsum("bcsij,mij->bcsm", equivalent, rotations).amax(2)
     angle = ((trace - 1) / 2).clamp(-1, 1).acos()
     return shift[..., None] + (object_model.radius * angle).square()
 
@@ -50,9 +50,10 @@ class GridPosterior:
     def __call__(self, trace: Trace, batch: Batch, object_model: ObjectModel) -> Tensor:
         """Return the loss of each image, (B,)."""
         encoding = trace.encoding
-        far = squared_distances(
+        distance = squared_distances(
             encoding.centers, encoding.rotations, batch.camera_from_object, object_model
         )
-        wanted = (-0.5 * far / (self.sigma * object_model.radius) ** 2).flatten(1).log_softmax(1)
-        found: Tensor = encoding.scores.flatten(1).log_softmax(1)
-        return (wanted.exp() * (wanted - found)).sum(1)
+        log_kernel = -0.5 * distance / (self.sigma * object_model.radius) ** 2
+        log_target = log_kernel.flatten(1).log_softmax(1)
+        log_posterior: Tensor = encoding.scores.flatten(1).log_softmax(1)
+        return (log_target.exp() * (log_target - log_posterior)).sum(1)

@@ -65,11 +65,12 @@ class BalancedBce(Bce):
         """Return weights that sum to 1/2 over y > 0 and over y = 0; to 1 if there is one class
         only.
         """
-        on = (y > 0).to(y.dtype)
-        share = on.sum((0, 2), keepdim=True)
-        rest = (1 - on).sum((0, 2), keepdim=True)
-        kinds = (share > 0).to(y.dtype) + (rest > 0).to(y.dtype)
-        return (on / share.clamp_min(1) + (1 - on) / rest.clamp_min(1)) / kinds
+        positive = (y > 0).to(y.dtype)
+        positives = positive.sum((0, 2), keepdim=True)
+        negatives = (1 - positive).sum((0, 2), keepdim=True)
+        classes = (positives > 0).to(y.dtype) + (negatives > 0).to(y.dtype)
+        weights = positive / positives.clamp_min(1) + (1 - positive) / negatives.clamp_min(1)
+        return weights / classes
 
 
 class Focal(Bce):

@@ -134,8 +134,8 @@ def measured_points(
         Points in the camera (B, N, 3) [m]; the true object points (B, N, 3) [m], object frame; and
         bool (B, N): the particle is on the mask, and its depth can belong to the object.
     """
-    seen = torch.cat([batch.depth, batch.mask.to(batch.depth)], dim=1)
-    z, on = gather_pixels(seen, nearest_pixel(particles.state)).unbind(-1)
+    maps = torch.cat([batch.depth, batch.mask.to(batch.depth)], dim=1)
+    z, on = gather_pixels(maps, nearest_pixel(particles.state)).unbind(-1)
     point = back_project(particles.state.detach(), z, batch.intrinsics)
     true = transform(invert(batch.camera_from_object), point)
     near = within_bounds((true - object_model.center.to(true)) / object_model.radius)

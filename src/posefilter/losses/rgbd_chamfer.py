@@ -46,8 +46,8 @@ class RgbdChamfer:
         places = positions[:, :, None] + offsets  # (B, P, S, 2)
         patch = sample(image, places.flatten(1, 2)).unflatten(1, places.shape[1:3])
         step = max(1, self.chunk // (len(image) * len(offsets) * target.shape[1]))
-        parts = [self.distance(part, target, valid) for part in patch.split(step, dim=1)]
-        return torch.cat(parts, dim=1).mean(1) * valid.any(1)
+        distances = [self.distance(part, target, valid) for part in patch.split(step, dim=1)]
+        return torch.cat(distances, dim=1).mean(1) * valid.any(1)
 
     def distance(self, patch: Tensor, target: Tensor, valid: Tensor) -> Tensor:
         """Return the sum of both directions' mean squared distance to the nearest.
@@ -60,8 +60,8 @@ class RgbdChamfer:
             apart = torch.cdist(flat, target).unflatten(1, (P, S))
             apart = apart.masked_fill(~valid[:, None, None], torch.inf)
             to_target, to_patch = apart.argmin(3), apart.argmin(2)  # (B, P, S), (B, P, M)
-        near = target.gather(1, to_target.flatten(1)[..., None].expand(-1, -1, 4))
-        forth = (flat - near).square().sum(-1).unflatten(1, (P, S)).mean(2)
-        own = patch.gather(2, to_patch[..., None].expand(-1, -1, -1, 4))
-        back = (own - target[:, None]).square().sum(-1) * valid[:, None]
-        return forth + back.sum(2) / valid.sum(1)[:, None].clamp_min(1)
+        nearest_target = target.gather(1, to_target.flatten(1)[..., None].expand(-1, -1, 4))
+        patch_to_target = (flat - nearest_target).square().sum(-1).unflatten(1, (P, S)).mean(2)
+        nearest_patch = patch.gather(2, to_patch[..., None].expand(-1, -1, -1, 4))
+        target_to_patch = (nearest_patch - target[:, None]).square().sum(-1) * valid[:, None]
+        return patch_to_target + target_to_patch.sum(2) / valid.sum(1)[:, None].clamp_min(1)

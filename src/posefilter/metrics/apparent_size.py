@@ -1,31 +1,39 @@
 """How large an object appears over a dataset: whether the depth and the intrinsics are right."""
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, NamedTuple
 
-import torch
 from torch import Tensor
 
-from posefilter.metrics.collect import Rows, concat_state
+from posefilter.metrics.collect import Rows
 
 _FEWEST = 3  # images that tell a dataset's scale
 
 
-class ApparentSizes(Rows):
+class ApparentSizeColumns(NamedTuple):
+    """The apparent sizes of N images: (N,) each."""
+
+    scale: Tensor  # relative to the mesh
+    contradicts: Tensor  # bool; the inputs cannot be right
+
+
+class ApparentSizes(Rows[ApparentSizeColumns]):
     """The apparent sizes of images that show the object; 1 where the inputs are right.
 
     images: in how many it could be told. ratio: the median of these. contradicting: in how many of
     them the inputs cannot be right.
     """
 
+    columns = ApparentSizeColumns
+
     def update(self, scale: Tensor, contradicts: Tensor) -> None:
         """Accumulate images; (B,) with NaN where nothing can be told, and (B,) bool."""
-        rows = torch.stack([x.double().cpu() for x in (scale, contradicts)], dim=1)
-        self.rows.append(rows[~rows[:, 0].isnan()])
+        measured = ~scale.isnan()
+        self.append(ApparentSizeColumns(scale[measured].cpu(), contradicts[measured].cpu()))
 
     def compute(self) -> dict[str, Any] | None:
         """Return the numbers; None where no image tells."""
-        scale, contradicts = concat_state(self.rows).reshape(-1, 2).T
+        scale, contradicts = self.all()
         if not len(scale):
             return None
         return {

@@ -71,12 +71,12 @@ def rank_of_truth(
     """
     weights = log_weights.exp()
     rows = max(1, chunk // log_weights.numel())
-    parts = []
-    for some, own in zip(poses.split(rows, dim=1), weights.split(rows, dim=1), strict=True):
-        far = (weights[:, None] * space.distance(some[:, :, None], poses[:, None])).sum(2)
-        parts.append(far / (1 - own).clamp_min(1e-6))
-    far_truth = (weights * space.distance(truth[:, None], poses)).sum(1, keepdim=True)
-    return (weights * (torch.cat(parts, dim=1) < far_truth)).sum(1).clamp(0, 1)
+    depths = []
+    for block, mass in zip(poses.split(rows, dim=1), weights.split(rows, dim=1), strict=True):
+        depth = (weights[:, None] * space.distance(block[:, :, None], poses[:, None])).sum(2)
+        depths.append(depth / (1 - mass).clamp_min(1e-6))  # of the others alone
+    depth_of_truth = (weights * space.distance(truth[:, None], poses)).sum(1, keepdim=True)
+    return (weights * (torch.cat(depths, dim=1) < depth_of_truth)).sum(1).clamp(0, 1)
 
 
 def on_object(mask: Tensor, pixels: Tensor) -> Tensor:

@@ -5,7 +5,7 @@ The third error of the challenge is in `vsd.py`, their average recall in `bop_re
 """
 
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -13,7 +13,7 @@ from torch import Tensor
 from posefilter.geometry.camera import project
 from posefilter.geometry.pose import transform
 from posefilter.geometry.symmetries import densify, list_equivalent
-from posefilter.metrics.collect import Rows, concat_state
+from posefilter.metrics.collect import Rows
 from posefilter.metrics.scores import median
 from posefilter.types import ObjectModel
 
@@ -132,13 +132,23 @@ def average_recall(errors: Tensor, thresholds: Sequence[float], unit: Tensor) ->
     return float(100 * (errors[:, None] < limits).double().mean())
 
 
-class BopErrors(Rows):
+class BopColumns(NamedTuple):
+    """The errors of N instances, and the diameters of their objects: (N,) each."""
+
+    mssd: Tensor  # [m]
+    mspd: Tensor  # [px] of an image 640 wide
+    diameter: Tensor  # [m]
+
+
+class BopErrors(Rows[BopColumns]):
     """MSSD and MSPD of all instances; poses that are not finite have infinite error.
 
     Args:
         models: The objects.
         **kwargs: Arguments of torchmetrics.Metric.
     """
+
+    columns = BopColumns
 
     def __init__(self, models: Sequence[ObjectModel], **kwargs: Any) -> None:
         super().__init__(**kwargs)
@@ -165,23 +175,24 @@ class BopErrors(Rows):
             object_id: (B,) index into `models`; the only one if None.
         """
         ids = [0] * len(truth) if object_id is None else object_id.tolist()
-        rows = torch.full((len(truth), 3), torch.inf, dtype=torch.float64, device=truth.device)
+        missed = torch.full((3, len(truth)), torch.inf, dtype=torch.float64, device=truth.device)
+        errors = BopColumns(*missed)
         for i, index in enumerate(ids):
-            rows[i, 2] = self.models[index].diameter
+            errors.diameter[i] = self.models[index].diameter
             if not bool(poses[i].isfinite().all()):
                 continue
             pair = poses[i].double(), truth[i].double()
-            known = self.symmetries[index], self.points[index]
-            rows[i, 0] = mssd(*pair, *known)
-            pixels = mspd(*pair, *known, intrinsics[i].double())
-            rows[i, 1] = pixels * REFERENCE_WIDTH / width
-        self.rows.append(rows)
+            shape = self.symmetries[index], self.points[index]
+            errors.mssd[i] = mssd(*pair, *shape)
+            pixels = mspd(*pair, *shape, intrinsics[i].double())
+            errors.mspd[i] = pixels * REFERENCE_WIDTH / width
+        self.append(errors)
 
     def compute(self) -> dict[str, dict[str, float]]:
         """Return {"mssd": {"ar", "median_mm"}, "mspd": {"ar", "median_px"}}, average recalls in [0,
         100]; pixels are those of an image 640 wide.
         """
-        surface, pixels, diameter = concat_state(self.rows).reshape(-1, 3).T
+        surface, pixels, diameter = self.all()
         return {
             "mssd": {
                 "ar": average_recall(surface, MSSD_THRESHOLDS, diameter),

@@ -1,7 +1,7 @@
 """torchmetrics classes: `update` with a batch, `compute` at the end, over all processes."""
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, Generic, NamedTuple, TypeVar
 
 import torch
 from torch import Tensor
@@ -14,11 +14,13 @@ from posefilter.geometry.spaces import PoseSpace
 from posefilter.geometry.symmetries import densify
 from posefilter.metrics.beliefs import entropy, mass_within, on_object, rank_of_truth, spread
 from posefilter.metrics.errors import NearestPoint, add, add_s, add_up_to_symmetry
-from posefilter.metrics.scores import summarize, summarize_rows
+from posefilter.metrics.scores import InstanceErrors, summarize_errors
 from posefilter.types import BeliefBatch, ObjectModel
 
 # of visibility; lower end included, upper only at 1
 RANGES = ((0.0, 0.3), (0.3, 0.5), (0.5, 0.8), (0.8, 1.0), (0.5, 1.0), (0.6, 1.0))
+
+Columns = TypeVar("Columns", bound=tuple[Tensor, ...])
 
 
 def concat_state(state: Any) -> Tensor:
@@ -26,27 +28,43 @@ def concat_state(state: Any) -> Tensor:
     return dim_zero_cat(state) if len(state) else torch.zeros(0, dtype=torch.float64)
 
 
-class Rows(Metric):
-    """Base of metrics that keep a row of numbers an image."""
+class Rows(Metric, Generic[Columns]):
+    """Base of metrics that keep a row of numbers an image, in the columns of a NamedTuple."""
 
     full_state_update = False
-    rows: list[Tensor]
+    columns: type[Any]  # the NamedTuple
+    rows: list[Tensor]  # of each batch (B, columns) float64
 
     def __init__(self, **kwargs: Any) -> None:
         super().__init__(**kwargs)
         self.add_state("rows", default=[], dist_reduce_fx="cat")
 
+    def append(self, columns: Columns) -> None:
+        """Accumulate the rows of a batch: columns of (B,)."""
+        self.rows.append(torch.stack([column.double() for column in columns], dim=1))
 
-class PoseErrors(Rows):
+    def last(self) -> Columns:
+        """Return the columns of the batch that was accumulated last, (B,) each."""
+        columns: Columns = self.columns(*self.rows[-1].T)
+        return columns
+
+    def all(self) -> Columns:
+        """Return the columns of all images, (N,) each."""
+        rows = concat_state(self.rows).reshape(-1, len(self.columns._fields))
+        columns: Columns = self.columns(*rows.T)
+        return columns
+
+
+class PoseErrors(Rows[InstanceErrors]):
     """ADD and ADD-S of all instances, and ADD up to symmetry where an object has symmetries;
     missed ones and poses that are not finite have infinite error.
-
-    A row is ADD, ADD-S, the object's diameter and ADD up to symmetry [m].
 
     Args:
         models: The objects.
         **kwargs: Arguments of torchmetrics.Metric.
     """
+
+    columns = InstanceErrors
 
     def __init__(self, models: Sequence[ObjectModel], **kwargs: Any) -> None:
         super().__init__(**kwargs)
@@ -63,35 +81,35 @@ class PoseErrors(Rows):
             object_id: (B,) index into `models`; the only one if None.
         """
         ids = [0] * len(truth) if object_id is None else object_id.tolist()
-        good = poses.isfinite().flatten(1).all(1)
-        rows = torch.full((len(truth), 4), torch.inf, dtype=torch.float64, device=truth.device)
+        finite = poses.isfinite().flatten(1).all(1)
+        missed = torch.full((4, len(truth)), torch.inf, dtype=torch.float64, device=truth.device)
+        errors = InstanceErrors(*missed)
         for index in sorted(set(ids)):
             selected = torch.tensor([i == index for i in ids], device=truth.device)
+            measured = selected & finite
             model, tree = self.models[index], self.trees[index]
-            a, b = poses[selected & good].double(), truth[selected & good].double()
-            rows[selected & good, 0] = add(a, b, model.points)
-            rows[selected & good, 1] = add_s(a, b, tree)
-            rows[selected, 2] = model.diameter
-            rows[selected & good, 3] = add_up_to_symmetry(
+            a, b = poses[measured].double(), truth[measured].double()
+            errors.add[measured] = add(a, b, model.points)
+            errors.add_s[measured] = add_s(a, b, tree)
+            errors.diameter[selected] = model.diameter
+            errors.add_up_to_symmetry[measured] = add_up_to_symmetry(
                 a, b, model.points, self.symmetries[index]
             )
-        self.rows.append(rows)
+        self.append(errors)
 
     def compute(self) -> dict[str, Any]:
         """Return {"instances", "missed", "add": {...}, "add_s": {...}} as in metrics.json, with
         "add_up_to_symmetry" where an object has symmetries.
         """
-        rows = concat_state(self.rows).reshape(-1, 4)
-        missed = int(rows[:, 0].isinf().sum())
-        return {"instances": len(rows), "missed": missed, **summarize_errors(rows, self.models)}
+        errors = self.all()
+        missed = int(errors.add.isinf().sum())
+        blocks = summarize_errors(errors, have_symmetries(self.models))
+        return {"instances": len(errors.add), "missed": missed, **blocks}
 
 
-def summarize_errors(rows: Tensor, models: Sequence[ObjectModel]) -> dict[str, dict[str, float]]:
-    """Return the blocks of metrics.json of rows of PoseErrors, (N, 4), of some objects."""
-    blocks = summarize_rows(rows[:, :3])
-    if any(len(model.symmetries) > 1 for model in models):
-        blocks["add_up_to_symmetry"] = summarize(rows[:, 3], rows[:, 2])
-    return blocks
+def have_symmetries(models: Sequence[ObjectModel]) -> bool:
+    """Return whether any of the objects has symmetries."""
+    return any(len(model.symmetries) > 1 for model in models)
 
 
 def lies_within(visible: Tensor, low: float, high: float) -> Tensor:
@@ -99,7 +117,21 @@ def lies_within(visible: Tensor, low: float, high: float) -> Tensor:
     return (visible >= low) & ((visible < high) if high < 1 else (visible <= 1))
 
 
-class ErrorsByVisibility(Rows):
+class VisibleErrors(NamedTuple):
+    """`InstanceErrors` and the share of each instance that is visible: (N,) each."""
+
+    add: Tensor
+    add_s: Tensor
+    diameter: Tensor
+    add_up_to_symmetry: Tensor
+    visibility: Tensor
+
+    def select(self, which: Tensor) -> InstanceErrors:
+        """Return the errors of some instances, (N,) bool."""
+        return InstanceErrors(*(getattr(self, name)[which] for name in InstanceErrors._fields))
+
+
+class ErrorsByVisibility(Rows[VisibleErrors]):
     """ADD and ADD-S of the instances in each range of visibility: means over all images hide the
     effect of occlusion. Unknown visibility is in none.
 
@@ -108,6 +140,8 @@ class ErrorsByVisibility(Rows):
         ranges: Lower (inclusive) and upper ends (exclusive, except 1).
         **kwargs: Arguments of torchmetrics.Metric.
     """
+
+    columns = VisibleErrors
 
     def __init__(
         self,
@@ -118,21 +152,20 @@ class ErrorsByVisibility(Rows):
         super().__init__(**kwargs)
         self.models, self.ranges = list(models), tuple(ranges)
 
-    def update(self, errors: Tensor, visibility: Tensor) -> None:
-        """Accumulate the rows of PoseErrors, (B, 4), with the instances' visible shares (B,)."""
-        self.rows.append(torch.cat([errors, visibility.to(errors)[:, None]], dim=1))
+    def update(self, errors: InstanceErrors, visibility: Tensor) -> None:
+        """Accumulate the errors of B instances with their visible shares (B,)."""
+        self.append(VisibleErrors(*errors, visibility.to(errors.add)))
 
     def compute(self) -> dict[str, Any]:
         """Return {"0.3-0.5": {"instances", "add": {...}, "add_s": {...}}, ...} without empty
         ranges.
         """
-        rows = concat_state(self.rows).reshape(-1, 5)
-        visible = rows[:, 4]
+        errors, symmetric = self.all(), have_symmetries(self.models)
         out = {}
         for low, high in self.ranges:
-            selected = lies_within(visible, low, high)
+            selected = lies_within(errors.visibility, low, high)
             if bool(selected.any()):
-                blocks = summarize_errors(rows[selected, :4], self.models)
+                blocks = summarize_errors(errors.select(selected), symmetric)
                 out[f"{low:g}-{high:g}"] = {"instances": int(selected.sum()), **blocks}
         return out
 
@@ -177,14 +210,24 @@ class ParticlesOnObject(Average):
         self.collect(on_object(mask, pixels))
 
 
-class BeliefQuality(Rows):
+class BeliefColumns(NamedTuple):
+    """Uncertainty and calibration of N beliefs: (N,) each."""
+
+    entropy: Tensor  # of the weights [nat]
+    effective_particles: Tensor  # 1 / sum w^2
+    spread_m: Tensor  # of the centers about that of the mean pose
+    spread_rad: Tensor  # of the rotations about that of the mean pose
+    mass_01d: Tensor  # weight of the poses with ADD below 0.1 diameters
+    mass_2cm: Tensor  # and below 2 cm
+    rank: Tensor  # of the truth by its mean distance to the particles; mean 0.5 if calibrated
+
+
+class BeliefQuality(Rows[BeliefColumns]):
     """Uncertainty and calibration of beliefs.
 
-    entropy: of the weights [nat]. effective_particles: 1 / sum w^2. spread_m, spread_rad: about the
-    mean pose. mass_01d, mass_2cm: weight of the poses with ADD below 0.1 diameters and 2 cm. rank:
-    mean rank of the truth by its mean distance to the particles (0.5 if calibrated).
-    distance_coverage_50, distance_coverage_90: percentage of images whose rank is at most 0.5 and
-    0.9 (50 and 90 if calibrated, less if overconfident); of highest-density sets see `Credibility`.
+    The means of `BeliefColumns`. distance_coverage_50, distance_coverage_90: percentage of images
+    whose rank is at most 0.5 and 0.9 (50 and 90 if calibrated, less if overconfident); of
+    highest-density sets see `Credibility`.
 
     Args:
         object_model: The object.
@@ -192,9 +235,7 @@ class BeliefQuality(Rows):
         **kwargs: Arguments of torchmetrics.Metric.
     """
 
-    names = (
-        "entropy", "effective_particles", "spread_m", "spread_rad", "mass_01d", "mass_2cm", "rank",
-    )  # fmt: skip
+    columns = BeliefColumns
 
     def __init__(self, object_model: ObjectModel, points: int = 256, **kwargs: Any) -> None:
         super().__init__(**kwargs)
@@ -205,22 +246,30 @@ class BeliefQuality(Rows):
     def update(self, belief: BeliefBatch, truth: Tensor) -> None:
         """Accumulate B beliefs, with the true poses (B, 4, 4)."""
         poses, log_w = belief.poses, belief.log_weights
-        values = [
-            entropy(log_w),
-            1 / log_w.exp().square().sum(1),
-            *spread(poses, log_w, self.space),
-            *(mass_within(poses, log_w, truth, self.points, d) for d in self.distances),
-            rank_of_truth(poses, log_w, truth, self.space),
-        ]
-        self.rows.append(torch.stack(values, dim=1).double())
+        spread_m, spread_rad = spread(poses, log_w, self.space)
+        mass_01d, mass_2cm = (
+            mass_within(poses, log_w, truth, self.points, d) for d in self.distances
+        )
+        self.append(
+            BeliefColumns(
+                entropy=entropy(log_w),
+                effective_particles=1 / log_w.exp().square().sum(1),
+                spread_m=spread_m,
+                spread_rad=spread_rad,
+                mass_01d=mass_01d,
+                mass_2cm=mass_2cm,
+                rank=rank_of_truth(poses, log_w, truth, self.space),
+            )
+        )
 
     def compute(self) -> dict[str, float]:
         """Return the mean of each metric; empty without images."""
         if not len(self.rows):
             return {}
-        rows = dim_zero_cat(self.rows)
-        out = dict(zip(self.names, rows.mean(0).tolist(), strict=True))
+        means = concat_state(self.rows).mean(0).tolist()
+        out = dict(zip(BeliefColumns._fields, means, strict=True))
+        rank = self.all().rank
         for percent in (50, 90):
-            inside = (rows[:, -1] <= percent / 100).double().mean()
+            inside = (rank <= percent / 100).double().mean()
             out[f"distance_coverage_{percent}"] = float(100 * inside)
         return out

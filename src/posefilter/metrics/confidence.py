@@ -1,12 +1,12 @@
 """How well a probability tells right from wrong, and whether it means what it says."""
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 from torchmetrics.functional.classification import binary_calibration_error
 
-from posefilter.metrics.collect import Rows, concat_state
+from posefilter.metrics.collect import Rows
 from posefilter.metrics.diagnostics import auroc
 
 COVERAGE = 0.8  # share of the images that are kept where an error rate is given
@@ -32,13 +32,13 @@ def list_bins(probability: Tensor, correct: Tensor, bins: int = _BINS) -> list[d
 
     (M,), (M,) bool.
     """
-    bin = (probability * bins).long().clamp(0, bins - 1)
+    bin_of_each = (probability * bins).long().clamp(0, bins - 1)
     out = []
-    for k in bin.unique().tolist():
-        own = bin == k
-        said, share = float(probability[own].mean()), float(correct[own].double().mean())
-        ends = {"from": k / bins, "to": (k + 1) / bins, "frames": int(own.sum())}
-        out.append({**ends, "probability": said, "right": share})
+    for k in bin_of_each.unique().tolist():
+        inside = bin_of_each == k
+        ends = {"from": k / bins, "to": (k + 1) / bins, "frames": int(inside.sum())}
+        mean, right = float(probability[inside].mean()), float(correct[inside].double().mean())
+        out.append({**ends, "probability": mean, "right": right})
     return out
 
 
@@ -56,15 +56,25 @@ def error_at_coverage(probability: Tensor, correct: Tensor, coverage: float = CO
     count = len(probability)
     if not count:
         return torch.tensor(torch.nan)
-    kept = max(1, round(coverage * count))
-    least = probability.double().sort(descending=True).values[kept - 1]
-    above, equal = probability > least, probability == least
-    share = (kept - above.sum()) / equal.sum()
+    accepted = max(1, round(coverage * count))
+    threshold = probability.double().sort(descending=True).values[accepted - 1]
+    above, equal = probability > threshold, probability == threshold
+    share = (accepted - above.sum()) / equal.sum()
     wrong = (~correct).double()
-    return (wrong[above].sum() + share * wrong[equal].sum()) / kept
+    return (wrong[above].sum() + share * wrong[equal].sum()) / accepted
 
 
-class Confidence(Rows):
+class ConfidenceColumns(NamedTuple):
+    """The probabilities of N frames, and what is true of them: (N,) each."""
+
+    presence: Tensor  # probability that the object is there
+    probability: Tensor  # that it is there and its pose right
+    present: Tensor  # bool; the object is in the image
+    correct: Tensor  # bool; and the pose within the tolerance
+    verdict: Tensor  # 1 where it is found, -1 where absent, 0 where unsure
+
+
+class Confidence(Rows[ConfidenceColumns]):
     """The quality of calibrated probabilities, over frames with and without the object.
 
     auroc: of the probability, right against wrong poses, among frames with the object.
@@ -75,6 +85,8 @@ class Confidence(Rows):
     one is found. bins: the reliability diagram over all frames.
     """
 
+    columns = ConfidenceColumns
+
     def update(
         self,
         presence: Tensor,
@@ -83,34 +95,27 @@ class Confidence(Rows):
         correct: Tensor,
         verdict: Tensor,
     ) -> None:
-        """Accumulate estimates.
-
-        Args:
-            presence: (B,) probabilities.
-            probability: (B,) likewise.
-            present: (B,) bool, the object is in the image.
-            correct: (B,) bool, and the pose within 0.1 diameters.
-            verdict: (B,) 1 where it is found, -1 where absent, 0 where unsure.
-        """
+        """Accumulate the estimates of B frames: (B,) each, as of `ConfidenceColumns`."""
         columns = (presence, probability, present, correct, verdict)
-        self.rows.append(torch.stack([x.double().cpu() for x in columns], dim=1))
+        self.append(ConfidenceColumns(*(column.cpu() for column in columns)))
 
     def compute(self) -> dict[str, Any]:
         """Return the numbers; those that need frames of a kind that is missing are NaN."""
-        presence, probability, there, right, verdict = concat_state(self.rows).T
-        own, is_right = there > 0, right > 0
-        with_object, declared = probability[own], verdict[own]
+        frames = self.all()
+        probability = frames.probability
+        present, correct = frames.present > 0, frames.correct > 0
+        probability_if_present, verdict_if_present = probability[present], frames.verdict[present]
         return {
-            "frames": int(own.sum()),
-            "frames_without": int((~own).sum()),
-            "auroc": float(auroc(with_object, is_right[own])),
-            "auroc_presence": float(auroc(presence, own)),
-            "ece": float(calibration_error(probability, is_right)),
-            "brier": float((probability - right).square().mean()),
-            "wrong": float((1 - right[own]).mean()),
-            "wrong_at_80": float(error_at_coverage(with_object, is_right[own])),
-            "found": float((declared > 0).double().mean()),
-            "absent": float((declared < 0).double().mean()),
-            "false_alarms": int((verdict[~own] > 0).sum()),
-            "bins": list_bins(probability, is_right),
+            "frames": int(present.sum()),
+            "frames_without": int((~present).sum()),
+            "auroc": float(auroc(probability_if_present, correct[present])),
+            "auroc_presence": float(auroc(frames.presence, present)),
+            "ece": float(calibration_error(probability, correct)),
+            "brier": float((probability - frames.correct).square().mean()),
+            "wrong": float((1 - frames.correct[present]).mean()),
+            "wrong_at_80": float(error_at_coverage(probability_if_present, correct[present])),
+            "found": float((verdict_if_present > 0).double().mean()),
+            "absent": float((verdict_if_present < 0).double().mean()),
+            "false_alarms": int((frames.verdict[~present] > 0).sum()),
+            "bins": list_bins(probability, correct),
         }

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from posefilter.geometry.pose_density import fit_density, log_density, log_density_held_out
-from posefilter.metrics.collect import Rows, concat_state, lies_within
+from posefilter.metrics.collect import Rows, lies_within
 from posefilter.types import BeliefBatch, ObjectModel
 
 LEVELS = tuple(round(0.05 * k, 2) for k in range(1, 20))  # of the coverage curve
@@ -41,45 +41,52 @@ def score_truth(belief: BeliefBatch, truth: Tensor, object_model: ObjectModel) -
     """
     rows = []
     poses, log_weights = belief.poses.detach().cpu(), belief.log_weights.detach().cpu()
-    for own, own_weights, true in zip(poses, log_weights, truth.detach().cpu(), strict=True):
-        normalized = own_weights.double().log_softmax(0)
+    for particles, weights, true in zip(poses, log_weights, truth.detach().cpu(), strict=True):
+        normalized = weights.double().log_softmax(0)
         size = (float(object_model.radius), float(object_model.diameter))
         density = fit_density(
-            own, normalized, object_model.center.cpu(), *size, object_model.symmetries.cpu()
+            particles, normalized, object_model.center.cpu(), *size, object_model.symmetries.cpu()
         )
-        at_truth, at_own = log_density(density, true[None])[0], log_density_held_out(density)
+        at_truth = log_density(density, true[None])[0]
+        at_particles = log_density_held_out(density)
         weights = density.log_weights.exp()
-        rank, mean = weights @ (at_own > at_truth).double(), weights @ at_own
+        rank, mean = weights @ (at_particles > at_truth).double(), weights @ at_particles
         rows.append(torch.stack([at_truth, rank, mean - at_truth]))
     return TruthScores(*(torch.stack(rows) if rows else torch.zeros(0, 3)).double().T)
 
 
-class Credibility(Rows):
+class CredibilityColumns(NamedTuple):
+    """How the beliefs of N images see the truth: (N,) each."""
+
+    log_density: Tensor  # as of `TruthScores`
+    rank: Tensor
+    nonconformity: Tensor
+    visibility: Tensor  # share of the object that is visible, NaN where unknown
+
+
+class Credibility(Rows[CredibilityColumns]):
     """The density of beliefs at the truth, and the coverage of credible sets, by visibility.
 
     log_density, log_density_p50: of the truth, mean and median [nat].  coverage_50, ...: percentage
     of the images whose credible set of that level holds the truth.  levels, all, quarters: curves.
     """
 
+    columns = CredibilityColumns
+
     def update(self, scores: TruthScores, visibility: Tensor) -> None:
         """Accumulate scores (B,) with the objects' visible shares (B,), NaN where unknown."""
-        self.rows.append(torch.stack([*scores, visibility.double().cpu()], dim=1))
-
-    def last(self) -> TruthScores:
-        """Return the scores that were accumulated last."""
-        return TruthScores(*self.rows[-1][:, :3].T)
+        self.append(CredibilityColumns(*scores, visibility.cpu()))
 
     def compute(self) -> dict[str, Any]:
         """Return the numbers; empty without images."""
-        rows = concat_state(self.rows)
-        if not len(rows):
+        density, rank, _, visibility = self.all()
+        if not len(rank):
             return {}
-        density, rank = rows[:, 0], rows[:, 1]
         median = float(np.median(density.numpy()))
         out = {"log_density": float(density.mean()), "log_density_p50": median}
         for percent in SHOWN:
             out[f"coverage_{percent}"] = 100 * measure_coverage(rank, percent / 100)
-        return {**out, **trace_curves(rank, rows[:, 3])}
+        return {**out, **trace_curves(rank, visibility)}
 
 
 def trace_curves(rank: Tensor, visible: Tensor) -> dict[str, Any]:
@@ -88,10 +95,10 @@ def trace_curves(rank: Tensor, visible: Tensor) -> dict[str, Any]:
     """
     quarters = []
     for low, high in QUARTERS:
-        own = lies_within(visible, low, high)
-        if bool(own.any()):
-            one = {"from": low, "to": high, "instances": int(own.sum())}
-            quarters.append({**one, "coverage": trace_curve(rank[own])})
+        inside = lies_within(visible, low, high)
+        if bool(inside.any()):
+            quarter = {"from": low, "to": high, "instances": int(inside.sum())}
+            quarters.append({**quarter, "coverage": trace_curve(rank[inside])})
     return {"levels": list(LEVELS), "all": trace_curve(rank), "quarters": quarters}
 
 

@@ -23,11 +23,11 @@ def add(poses: Tensor, truth: Tensor, points: Tensor) -> Tensor:
     shift = (translation_of(poses) - translation_of(truth)).expand(*lead, 3).reshape(-1, 3)
     points = points.to(turn)
     rows = max(1, _CHUNK // len(points))
-    parts = [
+    errors = [
         (points @ R.transpose(-1, -2) + t[:, None]).norm(dim=-1).mean(-1)
         for R, t in zip(turn.split(rows), shift.split(rows), strict=True)
     ]
-    return torch.cat(parts).view(lead) if parts else turn.new_zeros(lead)
+    return torch.cat(errors).view(lead) if errors else turn.new_zeros(lead)
 
 
 def add_up_to_symmetry(poses: Tensor, truth: Tensor, points: Tensor, symmetries: Tensor) -> Tensor:
@@ -47,9 +47,9 @@ def add_up_to_symmetry(poses: Tensor, truth: Tensor, points: Tensor, symmetries:
     """
     equal = list_equivalent(poses, truth, symmetries)
     if equal.shape[1] > _EXACT:
-        some = points[:: 1 + len(points) // _SOME]
-        _, likely = add(poses[:, None], equal, some).topk(_EXACT, dim=1, largest=False)
-        equal = equal.gather(1, likely[..., None, None].expand(-1, -1, 4, 4))
+        subset = points[:: 1 + len(points) // _SOME]
+        _, nearest = add(poses[:, None], equal, subset).topk(_EXACT, dim=1, largest=False)
+        equal = equal.gather(1, nearest[..., None, None].expand(-1, -1, 4, 4))
     return add(poses[:, None], equal, points).amin(1)
 
 
@@ -82,8 +82,8 @@ def add_s(poses: Tensor, truth: Tensor, points: Tensor | NearestPoint) -> Tensor
     guess_from_true = invert(poses.detach().cpu().double()) @ truth.detach().cpu().double()
     lead = guess_from_true.shape[:-2]
     rows = max(1, _CHUNK // len(near.points))
-    parts = [
-        near.distance(transform(some, near.points)).mean(-1)
-        for some in guess_from_true.reshape(-1, 4, 4).split(rows)
+    errors = [
+        near.distance(transform(block, near.points)).mean(-1)
+        for block in guess_from_true.reshape(-1, 4, 4).split(rows)
     ]
-    return (torch.cat(parts).view(lead) if parts else guess_from_true.new_zeros(lead)).to(poses)
+    return (torch.cat(errors).view(lead) if errors else guess_from_true.new_zeros(lead)).to(poses)

@@ -11,7 +11,7 @@ import torch
 from posefilter.files import open_whole_text
 from posefilter.forms import MOST
 from posefilter.limits import open_text
-from posefilter.metrics.scores import summarize_rows
+from posefilter.metrics.scores import InstanceErrors, summarize_errors
 
 FILE = "errors.csv"
 
@@ -71,14 +71,16 @@ def parse_row(row: dict[str, str]) -> ImageError:
     if missing:
         raise ValueError(f"column {missing[0]} is missing")
     kinds = ImageError.__annotations__
-    made = ImageError(*(kinds[name](row[name]) for name in ImageError._fields))
-    for name, value in zip(ImageError._fields, made, strict=True):
+    error = ImageError(*(kinds[name](row[name]) for name in ImageError._fields))
+    for name, value in zip(ImageError._fields, error, strict=True):
         if isinstance(value, float) and MOST < abs(value) < math.inf:
             raise ValueError(f"{name}={value} cannot be computed with")
-    return made
+    return error
 
 
-def summarize_errors(rows: Sequence[ImageError]) -> dict[str, dict[str, float]]:
+def summarize_images(rows: Sequence[ImageError]) -> dict[str, dict[str, float]]:
     """Return the blocks `add` and `add_s` of metrics.json for a set of images."""
-    numbers = [(row.add_mm, row.add_s_mm, row.diameter_mm) for row in rows]
-    return summarize_rows(torch.tensor(numbers, dtype=torch.float64).reshape(-1, 3) / 1000)
+    names = [f"{name}_mm" for name in InstanceErrors._fields]
+    columns = [[getattr(row, name) for row in rows] for name in names]
+    errors = InstanceErrors(*torch.tensor(columns, dtype=torch.float64) / 1000)
+    return summarize_errors(errors, symmetric=False)

@@ -66,30 +66,32 @@ class PartIoU(Metric):
         """
         height, width = batch.rgb.shape[-2:]
         truth, K = batch.camera_from_object, batch.intrinsics
-        good = poses.isfinite().flatten(1).all(1)
-        tried = torch.where(good[:, None, None], poses, truth)
+        finite = poses.isfinite().flatten(1).all(1)
+        placed = torch.where(finite[:, None, None], poses, truth)
         for k, points in enumerate(self.parts.values()):
             target = box_of_pose(truth, points, K, height, width)
-            found = box_of_pose(tried, points, K, height, width) * good[:, None]
-            seen = (target[:, 2:] > target[:, :2]).all(1)
-            self.totals[0, k] += box_iou(found, target)[seen].double().sum()
-            self.counts[0, k] += seen.sum()
+            box = box_of_pose(placed, points, K, height, width) * finite[:, None]
+            in_frame = (target[:, 2:] > target[:, :2]).all(1)
+            self.totals[0, k] += box_iou(box, target)[in_frame].double().sum()
+            self.counts[0, k] += in_frame.sum()
         for b in range(len(truth)):
-            self._add_masks(tried[b], bool(good[b]), batch, b)
+            self._add_masks(placed[b], bool(finite[b]), batch, b)
 
-    def _add_masks(self, pose: Tensor, good: bool, batch: Batch, b: int) -> None:
+    def _add_masks(self, pose: Tensor, finite: bool, batch: Batch, b: int) -> None:
         at = (batch.mask[b, 0] & (batch.depth[b, 0] > 0)).nonzero()
         if len(at) == 0:
             return
         at = at[:: max(1, len(at) // _PIXELS)]
         z = batch.depth[b, 0][at[:, 0], at[:, 1]]
         points = back_project(at.flip(1)[None].to(z), z[None], batch.intrinsics[b : b + 1])[0]
-        there = label_pixels(points, batch.camera_from_object[b], self.object_model)
-        here = label_pixels(points, pose, self.object_model) if good else torch.full_like(there, -2)
+        labels = label_pixels(points, batch.camera_from_object[b], self.object_model)
+        guesses = torch.full_like(labels, -2)
+        if finite:
+            guesses = label_pixels(points, pose, self.object_model)
         for k in range(len(self.parts)):
-            true, found = there == k, here == k
+            true, estimated = labels == k, guesses == k
             if bool(true.any()):
-                self.totals[1, k] += (true & found).sum() / (true | found).sum()
+                self.totals[1, k] += (true & estimated).sum() / (true | estimated).sum()
                 self.counts[1, k] += 1
 
     def compute(self) -> dict[str, Any]:

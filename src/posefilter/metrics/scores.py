@@ -3,9 +3,20 @@
 Errors are (N,) [m], one for each instance; a missed one is infinite.
 """
 
+from typing import NamedTuple
+
 from torch import Tensor
 
 from posefilter.errors import UserError
+
+
+class InstanceErrors(NamedTuple):
+    """The errors of N instances, and the diameters of their objects: (N,) each [m]."""
+
+    add: Tensor
+    add_s: Tensor
+    diameter: Tensor
+    add_up_to_symmetry: Tensor  # that of `add` where the object has no symmetries
 
 
 def auc(errors: Tensor, limit: float = 0.1) -> float:
@@ -67,14 +78,15 @@ def summarize(errors: Tensor, diameter: float | Tensor) -> dict[str, float]:
     }
 
 
-def summarize_rows(rows: Tensor) -> dict[str, dict[str, float]]:
-    """Return the blocks `add` and `add_s` of metrics.json.
-
-    Args:
-        rows: (N, 3) of each instance ADD, ADD-S and the object's diameter [m].
-    """
-    add, add_s, diameter = rows.T
-    return {"add": summarize(add, diameter), "add_s": summarize(add_s, diameter)}
+def summarize_errors(errors: InstanceErrors, symmetric: bool) -> dict[str, dict[str, float]]:
+    """Return the blocks `add` and `add_s` of metrics.json, and `add_up_to_symmetry` if asked."""
+    blocks = {
+        "add": summarize(errors.add, errors.diameter),
+        "add_s": summarize(errors.add_s, errors.diameter),
+    }
+    if symmetric:
+        blocks["add_up_to_symmetry"] = summarize(errors.add_up_to_symmetry, errors.diameter)
+    return blocks
 
 
 def overall(add_auc: float | None, on_object: float, iou: float) -> float:

@@ -2,11 +2,12 @@
 
 A method predicts by itself. Lightning and torchmetrics, which train and test it, take seconds to
 import, so that a method becomes a LightningModule only where that is needed: see `with_lightning`.
+
+What a hook does stands beside it: metrics in evaluation.py, windows in zoom.py, clipping in
+clipping.py, schedules in lr_schedulers.py, probabilities in posefilter/confidence.
 """
 
 import itertools
-import logging
-import math
 import time
 from collections.abc import Callable, Iterable
 from functools import cache, cached_property
@@ -20,25 +21,24 @@ from torch.optim.lr_scheduler import LRScheduler
 from posefilter.capabilities import Capabilities, check_parts, collect_provided
 from posefilter.confidence.apparent_size import ApparentSize
 from posefilter.confidence.belief_scale import calibrate_belief
-from posefilter.confidence.blank import find_blank
 from posefilter.confidence.calibration import Assessment, Calibration
 from posefilter.confidence.features import measure_belief, measure_depth, measure_print
 from posefilter.confidence.second_look import look_again
-from posefilter.confidence.tolerance import RIGHT, measure_pose_errors
-from posefilter.confidence.verdicts import Costs, score_verdicts
+from posefilter.confidence.tolerance import RIGHT
+from posefilter.confidence.verdicts import Costs
 from posefilter.data.absent import hide_annotation
 from posefilter.errors import UserError
 from posefilter.filters.loop import ParticleFilter
-from posefilter.geometry.boxes import box_of_pose
 from posefilter.geometry.camera import project
 from posefilter.geometry.pose import origin_of
 from posefilter.geometry.spaces import PoseSpace
 from posefilter.metrics.results import compute_checkpoint_score, flatten
+from posefilter.models import evaluation
 from posefilter.models.box_heads import PoseBox
-from posefilter.models.clipping import clip_submodules
-from posefilter.models.lr_schedulers import find_length
+from posefilter.models.clipping import SubmoduleClipper
+from posefilter.models.lr_schedulers import find_length, start_schedule
 from posefilter.models.quantization import unpack_object
-from posefilter.models.zoom import choose_part, search
+from posefilter.models.zoom import check_zoom, choose_part, search
 from posefilter.protocols import Loss, Space
 from posefilter.types import Batch, BeliefBatch, ObjectModel, ParticleOutput, Particles, Step, Trace
 
@@ -47,8 +47,6 @@ if TYPE_CHECKING:
 else:
     Module = nn.Module  # `with_lightning` adds Lightning's
 
-log = logging.getLogger(__name__)
-_PATIENCE = 20  # steps
 _STAGES = {"train": 0, "validate": 1, "test": 2, "predict": 3}
 
 
@@ -98,14 +96,72 @@ class PoseEstimator(Module):
         self._scores: Any = None  # made when they are first asked for
         self.seconds_per_image: list[float] = []  # one number for each image
         self.last_belief: BeliefBatch | None = None  # of the batch that the metrics took in last
-        self.skipped_steps = self.skipped_in_a_row = 0  # whose gradient was not finite
+        self.clipper = SubmoduleClipper()
         self.time_spent = 0.0  # share of the training's time budget, where it has one
         self.recipe: dict[str, Any] = {}  # how it was built: plain data, carried in its checkpoints
+
+    def set_object(self, object_model: ObjectModel) -> None:
+        """Set the object, and forget the metrics of another.
+
+        Raises:
+            UserError: The method's components do not fit each other, see capabilities.py; or it has
+                neither a pose nor a box of its own.
+        """
+        check_parts(self)
+        check_zoom(self)
+        if type(self).box is PoseEstimator.box and "pose" not in collect_provided(self):
+            raise UserError(
+                f"{type(self).__name__}: `provides` lacks pose, so that it needs a box() of its "
+                "own, such as models/box_heads.py has: the default is the box of the pose"
+            )
+        self._object_model = object_model
+        self._scores = None
 
     @cached_property
     def capabilities(self) -> frozenset[str]:
         """What the method and its components provide; metrics and figures are chosen by it."""
         return collect_provided(self)
+
+    @property
+    def object_model(self) -> ObjectModel:
+        """The object.
+
+        Raises:
+            UserError: `set_object` has not been called.
+        """
+        if self._object_model is None:
+            raise UserError(
+                "the method has no object yet: give it data, or a checkpoint that holds one"
+            )
+        return self._object_model
+
+    @property
+    def model(self) -> ObjectModel:
+        """The earlier name of `object_model`."""
+        return self.object_model
+
+    @property
+    def device(self) -> torch.device:
+        """Where the weights are."""
+        # asked for many times a frame, and a search of all modules takes long
+        for module in itertools.chain(self._first, self.modules()):
+            for weight in module._parameters.values():
+                if weight is not None:
+                    self._first = self._first or (module,)
+                    return weight.device
+        return torch.device("cpu")
+
+    def generator(self, stage: str, batch_number: int) -> Generator:
+        """Return the random generator of a batch: a function of seed, stage, epoch and number; in
+        training of the process's rank, too.
+        """
+        if stage == "train" and self._trainer is not None:
+            batch_number = batch_number * self._trainer.world_size + self._trainer.global_rank
+        epoch = getattr(self, "current_epoch", 0) if stage == "train" else 0
+        seed = ((self.seed * 8 + _STAGES[stage]) * 100_003 + epoch) * 1_000_003 + batch_number
+        return torch.Generator(device=self.device).manual_seed(seed % (1 << 63))
+
+    # -- what a method defines ---------------------------------------------------------------------
 
     @property
     def space(self) -> Space:
@@ -142,114 +198,22 @@ class PoseEstimator(Module):
         """
         raise NotImplementedError(f"{type(self).__name__} must implement measure()")
 
-    @property
-    def object_model(self) -> ObjectModel:
-        """The object.
+    def box(self, trace: Trace, batch: Batch) -> Tensor:
+        """Return the bounding box of the object's hull at the estimated pose, (B, 4) [px].
 
-        Raises:
-            UserError: `set_object` has not been called.
+        A method without a pose has one of its own.
         """
-        if self._object_model is None:
-            raise UserError(
-                "the method has no object yet: give it data, or a checkpoint that holds one"
-            )
-        return self._object_model
+        return PoseBox()(trace, batch, self.object_model)
 
-    @property
-    def model(self) -> ObjectModel:
-        """The earlier name of `object_model`."""
-        return self.object_model
+    def particle_pixels(self, particles: Particles, batch: Batch) -> Tensor:
+        """Return where particles are in the image, (B, N, 2) [px].
 
-    @property
-    def device(self) -> torch.device:
-        """Where the weights are."""
-        # asked for many times a frame, and a search of all modules takes long
-        for module in itertools.chain(self._first, self.modules()):
-            for weight in module._parameters.values():
-                if weight is not None:
-                    self._first = self._first or (module,)
-                    return weight.device
-        return torch.device("cpu")
-
-    @property
-    def scores(self) -> Any:
-        """The metrics of the object by name, a ModuleDict; created at the first use."""
-        if self._scores is None:
-            self._scores = nn.ModuleDict(self.make_metrics()).to(self.device)
-            for metric in self._scores.values():
-                metric.distributed_available_fn = _has_all_images
-        return self._scores
-
-    def make_metrics(self) -> dict[str, nn.Module]:
-        """Create the metrics of the object, by name."""
-        # torchmetrics: prediction needs none
-        from posefilter.metrics.apparent_size import ApparentSizes
-        from posefilter.metrics.bop import BopErrors
-        from posefilter.metrics.collect import (
-            BeliefQuality,
-            BoxIoU,
-            ErrorsByVisibility,
-            ParticlesOnObject,
-            PoseErrors,
-        )
-        from posefilter.metrics.confidence import Confidence
-        from posefilter.metrics.credibility import Credibility
-        from posefilter.metrics.parts import PartIoU
-
-        metrics: dict[str, nn.Module] = {
-            "iou": BoxIoU(),
-            "particles_on_object": ParticlesOnObject(),
-        }
-        if "pose" in self.capabilities:
-            metrics["poses"] = PoseErrors([self.object_model])
-            metrics["bop"] = BopErrors([self.object_model])
-            metrics["by_visibility"] = ErrorsByVisibility([self.object_model])
-            metrics["belief"] = BeliefQuality(self.object_model)
-            metrics["credibility"] = Credibility()
-            metrics["confidence"] = Confidence()
-            metrics["apparent_size"] = ApparentSizes()
-            if self.object_model.parts:
-                metrics["parts"] = PartIoU(self.object_model)
-        return metrics
-
-    def set_object(self, object_model: ObjectModel) -> None:
-        """Set the object, and forget the metrics of another.
-
-        Raises:
-            UserError: The method's components do not fit each other, see capabilities.py; or it has
-                neither a pose nor a box of its own.
+        A pose is where it puts the object's center.
         """
-        check_parts(self)
-        if getattr(self.filter, "zoom_diameter", None) is not None:
-            if "pose_space" not in self.capabilities:
-                raise UserError(
-                    "filter.zoom_diameter: needs a method whose particles are poses, such as "
-                    f"pose_pf; those of {type(self).__name__} are places in one image"
-                )
-            if type(self.filter).forward is not ParticleFilter.forward:
-                raise UserError(
-                    f"filter.zoom_diameter: {type(self.filter).__name__} has a forward() of its "
-                    "own, which windows would not run; choose null"
-                )
-        if type(self).box is PoseEstimator.box and "pose" not in collect_provided(self):
-            raise UserError(
-                f"{type(self).__name__}: `provides` lacks pose, so that it needs a box() of its "
-                "own, such as models/box_heads.py has: the default is the box of the pose"
-            )
-        self._object_model = object_model
-        self._scores = None
-
-    def generator(self, stage: str, batch_number: int) -> Generator:
-        """Return the random generator of a batch: a function of seed, stage, epoch and number; in
-        training of the process's rank, too.
-        """
-        if stage == "train" and self._trainer is not None:
-            batch_number = batch_number * self._trainer.world_size + self._trainer.global_rank
-        epoch = getattr(self, "current_epoch", 0) if stage == "train" else 0
-        seed = ((self.seed * 8 + _STAGES[stage]) * 100_003 + epoch) * 1_000_003 + batch_number
-        return torch.Generator(device=self.device).manual_seed(seed % (1 << 63))
-
-    # -- confidence -------------------------------------------------------------------------------
+        if not isinstance(self.space, PoseSpace):
+            return particles.state
+        center = self.object_model.center.to(particles.state.device)
+        return project(origin_of(particles.state, center), batch.intrinsics)
 
     def collect_features(self, trace: Trace, batch: Batch) -> dict[str, Tensor]:
         """Return what speaks for each estimate, by name.
@@ -273,134 +237,7 @@ class PoseEstimator(Module):
         """
         return None
 
-    @torch.no_grad()
-    def assess(self, trace: Trace, batch: Batch) -> Assessment | None:
-        """Return the probabilities that the object is there and its pose right, None where the
-        method is not calibrated; arguments as of `collect_features`.
-        """
-        if self.calibration is None:
-            return None
-        features = self.collect_features(trace, batch)
-        return self.calibration.assess(features, self.pose_tolerance)
-
-    def calibrate_belief(
-        self, belief: BeliefBatch, found: Assessment | None
-    ) -> tuple[BeliefBatch, Tensor | None]:
-        """Return beliefs as wide as the errors of right estimates are (confidence/belief_scale.py).
-
-        Args:
-            belief: B beliefs, as the filter leaves them.
-            found: What `assess` says of them; where it is None, or the calibration knows no scale,
-                beliefs are returned as they are.
-
-        Returns:
-            The beliefs; and of each, how many of the first poses are draws about the estimate,
-            (B,), None where they are as they were.
-        """
-        if found is None or self.calibration is None or self.calibration.belief_scale is None:
-            return belief, None
-        assert found.features is not None
-        right = self.calibration.assess(found.features).probability  # within the default tolerance
-        features = self.calibration.standardize(found.features)
-        scale = self.calibration.belief_scale
-        return calibrate_belief(belief, right, features, scale, self.object_model)
-
-    # -- training ---------------------------------------------------------------------------------
-
-    def training_losses(self, batch: Batch, generator: Generator) -> dict[str, Tensor]:
-        """Return the losses by name, (B,) each; their sum is minimized.
-
-        The default is the chosen loss of one roll-out.
-        """
-        trace = self.train_filter(batch, self, generator)
-        return {"loss": self.loss(trace, batch, self.object_model)}
-
-    def training_step(self, batch: Batch, batch_number: int) -> Tensor:
-        """Return the sum of the losses' means, the loss that is minimized.
-
-        It is logged as `train/loss`, its terms as `train/loss_<name>`: `train/loss_main` is that
-        of the group `loss`.
-
-        Raises:
-            FloatingPointError: It is not finite.
-        """
-        losses = self.training_losses(batch, self.generator("train", batch_number))
-        means = {name: value.mean() for name, value in losses.items()}
-        total = torch.stack(list(means.values())).sum()
-        if not bool(total.isfinite()):
-            raise FloatingPointError(
-                f"the loss is no longer finite: { ({k: v.item() for k, v in means.items()}) }"
-            )
-        for name, value in means.items():
-            self.log_scalar(f"loss_{'main' if name == 'loss' else name}", value.detach())
-        if self._trainer is not None:
-            self.log("train/loss", total.detach(), prog_bar=True)
-            self.log("train/learning_rate", self.trainer.optimizers[0].param_groups[0]["lr"])
-        return total
-
-    def log_scalar(self, name: str, value: Tensor) -> None:
-        """Log a training scalar, if there is a trainer."""
-        if self._trainer is not None:
-            self.log(f"train/{name}", value)
-
-    def configure_optimizers(self) -> Any:
-        """Build the optimizer and its schedule over the run's steps."""
-        named = ((name, p) for name, p in self.named_parameters() if p.requires_grad)
-        optimizer = self.make_optimizer(named)
-        if self.make_scheduler is None:
-            return optimizer
-        length = find_length(self.make_scheduler)
-        expected = self.trainer.estimated_stepping_batches if length else 0
-        if not math.isfinite(expected):
-            raise UserError(
-                "trainer.max_steps=-1: the learning rate's schedule goes by the number of steps; "
-                "give it, or choose scheduler=none"
-            )
-        steps = int(expected)
-        scheduler = self.make_scheduler(optimizer, **({length: steps} if length else {}))
-        every_step = {"scheduler": scheduler, "interval": "step"}
-        return {"optimizer": optimizer, "lr_scheduler": every_step}
-
-    def configure_gradient_clipping(
-        self,
-        optimizer: Optimizer,
-        gradient_clip_val: float | None = None,
-        gradient_clip_algorithm: str | None = None,
-    ) -> None:
-        """Clip the gradient of each submodule by its own norm.
-
-        A large gradient of one network then does not shrink another's. A submodule whose gradient
-        is not finite is not updated by this step, with a warning; also where nothing is clipped.
-
-        Raises:
-            FloatingPointError: 20 steps in a row had such a gradient in any submodule.
-        """
-        skipped = clip_submodules(self, gradient_clip_val)
-        self.skipped_steps += bool(skipped)
-        self.skipped_in_a_row = self.skipped_in_a_row + 1 if skipped else 0
-        if skipped and self.skipped_steps in (1, 10, 100, 1000, 10_000):
-            log.warning(
-                "step %d does not update %s, whose gradient is not finite (%d such steps so far)",
-                getattr(self, "global_step", 0),
-                ", ".join(skipped),
-                self.skipped_steps,
-            )
-        if self.skipped_in_a_row == _PATIENCE:
-            raise FloatingPointError(
-                f"the gradient of {', '.join(skipped)} was not finite in {_PATIENCE} steps in a "
-                "row: in a roll-out it can grow with each step; choose model.detach_position=true "
-                "or model/train_rollout=short (image space), or fewer filter.steps"
-            )
-
-    # -- validation and test ----------------------------------------------------------------------
-
-    def validation_step(self, batch: Batch, batch_number: int) -> Trace:  # type: ignore[override]
-        """Run the filter and update the metrics; callbacks are given the trace."""
-        return self._evaluate(batch, "validate", batch_number)
-
-    def test_step(self, batch: Batch, batch_number: int) -> Trace:  # type: ignore[override]
-        """Run the filter and update the metrics; callbacks are given the trace."""
-        return self._evaluate(batch, "test", batch_number)
+    # -- prediction --------------------------------------------------------------------------------
 
     def predict_step(self, batch: Batch, batch_number: int) -> Trace:
         """Run the filter, again where its answer is doubtful (`look_again`); mask and pose of the
@@ -428,6 +265,108 @@ class PoseEstimator(Module):
         """
         return choose_part(self, image) if "pose_space" in self.capabilities else None
 
+    @torch.no_grad()
+    def assess(self, trace: Trace, batch: Batch) -> Assessment | None:
+        """Return the probabilities that the object is there and its pose right, None where the
+        method is not calibrated; arguments as of `collect_features`.
+        """
+        if self.calibration is None:
+            return None
+        features = self.collect_features(trace, batch)
+        return self.calibration.assess(features, self.pose_tolerance)
+
+    def calibrate_belief(
+        self, belief: BeliefBatch, assessment: Assessment | None
+    ) -> tuple[BeliefBatch, Tensor | None]:
+        """Return beliefs as wide as the errors of right estimates are (confidence/belief_scale.py).
+
+        Args:
+            belief: B beliefs, as the filter leaves them.
+            assessment: What `assess` says of them; where it is None, or the calibration knows no
+                scale, beliefs are returned as they are.
+
+        Returns:
+            The beliefs; and of each, how many of the first poses are draws about the estimate,
+            (B,), None where they are as they were.
+        """
+        if assessment is None or self.calibration is None or self.calibration.belief_scale is None:
+            return belief, None
+        features = assessment.features
+        assert features is not None
+        right = self.calibration.assess(features).probability  # within the default tolerance
+        standardized = self.calibration.standardize(features)
+        scale = self.calibration.belief_scale
+        return calibrate_belief(belief, right, standardized, scale, self.object_model)
+
+    # -- training ----------------------------------------------------------------------------------
+
+    def training_step(self, batch: Batch, batch_number: int) -> Tensor:
+        """Return the sum of the losses' means, the loss that is minimized.
+
+        It is logged as `train/loss`, its terms as `train/loss_<name>`: `train/loss_main` is that
+        of the group `loss`.
+
+        Raises:
+            FloatingPointError: It is not finite.
+        """
+        losses = self.training_losses(batch, self.generator("train", batch_number))
+        means = {name: value.mean() for name, value in losses.items()}
+        total = torch.stack(list(means.values())).sum()
+        if not bool(total.isfinite()):
+            raise FloatingPointError(
+                f"the loss is no longer finite: { ({k: v.item() for k, v in means.items()}) }"
+            )
+        for name, value in means.items():
+            self.log_scalar(f"loss_{'main' if name == 'loss' else name}", value.detach())
+        if self._trainer is not None:
+            self.log("train/loss", total.detach(), prog_bar=True)
+            self.log("train/learning_rate", self.trainer.optimizers[0].param_groups[0]["lr"])
+        return total
+
+    def training_losses(self, batch: Batch, generator: Generator) -> dict[str, Tensor]:
+        """Return the losses by name, (B,) each; their sum is minimized.
+
+        The default is the chosen loss of one roll-out.
+        """
+        trace = self.train_filter(batch, self, generator)
+        return {"loss": self.loss(trace, batch, self.object_model)}
+
+    def log_scalar(self, name: str, value: Tensor) -> None:
+        """Log a training scalar, if there is a trainer."""
+        if self._trainer is not None:
+            self.log(f"train/{name}", value)
+
+    def configure_optimizers(self) -> Any:
+        """Build the optimizer and its schedule over the run's steps."""
+        named = ((name, p) for name, p in self.named_parameters() if p.requires_grad)
+        optimizer = self.make_optimizer(named)
+        if self.make_scheduler is None:
+            return optimizer
+        scheduler = start_schedule(self.make_scheduler, optimizer, self.trainer)
+        return {
+            "optimizer": optimizer,
+            "lr_scheduler": {"scheduler": scheduler, "interval": "step"},
+        }
+
+    def configure_gradient_clipping(
+        self,
+        optimizer: Optimizer,
+        gradient_clip_val: float | None = None,
+        gradient_clip_algorithm: str | None = None,
+    ) -> None:
+        """Clip the gradient of each submodule by its own norm (`SubmoduleClipper`)."""
+        self.clipper.clip(self, gradient_clip_val, getattr(self, "global_step", 0))
+
+    # -- validation and test -----------------------------------------------------------------------
+
+    def validation_step(self, batch: Batch, batch_number: int) -> Trace:  # type: ignore[override]
+        """Run the filter and update the metrics; callbacks are given the trace."""
+        return self._evaluate(batch, "validate", batch_number)
+
+    def test_step(self, batch: Batch, batch_number: int) -> Trace:  # type: ignore[override]
+        """Run the filter and update the metrics; callbacks are given the trace."""
+        return self._evaluate(batch, "test", batch_number)
+
     def _evaluate(self, batch: Batch, stage: str, batch_number: int) -> Trace:
         start = time.perf_counter()
         trace = self._run(batch, self.generator(stage, batch_number))
@@ -437,113 +376,26 @@ class PoseEstimator(Module):
         self.update_metrics(trace, batch)
         return trace
 
+    @property
+    def scores(self) -> Any:
+        """The metrics of the object by name, a ModuleDict; created at the first use."""
+        if self._scores is None:
+            self._scores = nn.ModuleDict(self.make_metrics()).to(self.device)
+            for metric in self._scores.values():
+                metric.distributed_available_fn = _has_all_images
+        return self._scores
+
+    def make_metrics(self) -> dict[str, nn.Module]:
+        """Create the metrics of the object, by name."""
+        return evaluation.make_metrics(self.object_model, self.capabilities)
+
     def update_metrics(self, trace: Trace, batch: Batch) -> None:
         """Add a batch's errors to the metrics."""
-        from posefilter.metrics.credibility import score_truth  # torchmetrics
-
-        height, width = batch.rgb.shape[-2:]
-        truth = box_of_pose(
-            batch.camera_from_object, self.object_model.hull, batch.intrinsics, height, width
-        )
-        self.scores["iou"].update(self.box(trace, batch), truth)
-        pixels = self.particle_pixels(trace.particles[-1], batch)
-        self.scores["particles_on_object"].update(batch.mask, pixels)
-        best, true_pose = trace.belief.best, batch.camera_from_object
-        self.last_belief = trace.belief
-        if "poses" in self.scores:
-            self.scores["poses"].update(best, true_pose)
-            self.scores["bop"].update(best, true_pose, batch.intrinsics, width)
-            self.scores["by_visibility"].update(self.scores["poses"].rows[-1], batch.visibility)
-            found = self.judge_confidence(trace, batch, present=True)
-            belief, _ = self.calibrate_belief(trace.belief, found)
-            self.last_belief = belief
-            self.scores["belief"].update(belief, true_pose)
-            seen = score_truth(belief, true_pose, self.object_model)
-            self.scores["credibility"].update(seen, batch.visibility)
-        if "parts" in self.scores:
-            self.scores["parts"].update(best, batch)
-
-    def last_assessment(self, count: int) -> Assessment:
-        """Return the probabilities of the batch that the metrics took in last, of `count` images;
-        NaN where the method is not calibrated.
-        """
-        if self.calibration is None or "confidence" not in self.scores:
-            return Assessment(*torch.full((2, count), torch.nan, dtype=torch.float64))
-        presence, probability = self.scores["confidence"].rows[-1][:, :2].T
-        return Assessment(presence, probability)
-
-    def judge_confidence(self, trace: Trace, batch: Batch, present: bool) -> Assessment | None:
-        """Add a batch's probabilities, where the method is calibrated, and apparent sizes, where it
-        can tell them, to the metrics; return the probabilities.
-
-        Args:
-            trace: A finished run of the filter.
-            batch: Its images.
-            present: Whether the object is in them; if not, the batch's poses are not used.
-        """
-        size = self.measure_apparent_size(trace, batch)
-        if present and "apparent_size" in self.scores:
-            unknown = torch.full((len(batch.rgb),), torch.nan)
-            known = (unknown, unknown) if size is None else (size.scale, size.contradicts())
-            self.scores["apparent_size"].update(*known)
-        found = self.assess(trace, batch)
-        if found is None:
-            return None
-        right = torch.zeros(len(batch.rgb), dtype=torch.bool)
-        if present:
-            truth = batch.camera_from_object
-            errors = measure_pose_errors(trace.belief.best, truth, self.object_model)
-            right = self.pose_tolerance.accepts(errors)
-        verdict = score_verdicts(found, self.costs)
-        if size is not None:  # of a wrong size none is found
-            wrong = size.contradicts().to(verdict.device)
-            verdict = torch.where(wrong, verdict.clamp_max(0), verdict)
-        rgb, depth = batch.rgb.permute(0, 2, 3, 1).contiguous().cpu(), batch.depth[:, 0].cpu()
-        pairs = zip(rgb.numpy(), depth.numpy(), strict=True)
-        blank = torch.tensor([bool(find_blank(*pair)) for pair in pairs])
-        verdict = torch.where(blank.to(verdict.device), 0, verdict)  # as of a result
-        self.scores["confidence"].update(
-            found.presence, found.probability, torch.full_like(right, present), right, verdict
-        )
-        return found
-
-    def box(self, trace: Trace, batch: Batch) -> Tensor:
-        """Return the bounding box of the object's hull at the estimated pose, (B, 4) [px].
-
-        A method without a pose has one of its own.
-        """
-        return PoseBox()(trace, batch, self.object_model)
-
-    def particle_pixels(self, particles: Particles, batch: Batch) -> Tensor:
-        """Return where particles are in the image, (B, N, 2) [px].
-
-        A pose is where it puts the object's center.
-        """
-        if not isinstance(self.space, PoseSpace):
-            return particles.state
-        center = self.object_model.center.to(particles.state.device)
-        return project(origin_of(particles.state, center), batch.intrinsics)
+        self.last_belief = evaluation.update_metrics(self, trace, batch)
 
     def compute_metrics(self) -> dict[str, Any]:
         """Return the metrics since the last reset, in the form of metrics.json."""
-        out: dict[str, Any] = {"instances": 0, "missed": 0}
-        out |= dict.fromkeys(("add", "add_s", "add_up_to_symmetry", "mssd", "mspd"))
-        if "poses" in self.scores:
-            out |= self.scores["poses"].compute() | self.scores["bop"].compute()
-        else:
-            out["instances"] = int(self.scores["iou"].count)
-        for name in ("iou", "particles_on_object"):
-            out[name] = float(self.scores[name].compute())
-        times = self.seconds_per_image
-        out["seconds_per_image"] = sum(times) / len(times) if times else None
-        out["belief"] = self.scores["belief"].compute() if "poses" in self.scores else None
-        known = self.calibration is not None and "confidence" in self.scores
-        out["confidence"] = self.scores["confidence"].compute() if known else None
-        if known:
-            out["confidence"]["pose_tolerance"] = self.pose_tolerance.describe()
-        for name in ("credibility", "by_visibility", "apparent_size", "parts"):
-            out[name] = self.scores[name].compute() if name in self.scores else None
-        return out
+        return evaluation.compute_metrics(self)
 
     def _reset(self) -> None:
         self.seconds_per_image = []
@@ -573,7 +425,7 @@ class PoseEstimator(Module):
         self.log_dict({f"{split}/{name}": value for name, value in flatten(results).items()})
         return results
 
-    # -- checkpoints ------------------------------------------------------------------------------
+    # -- checkpoints -------------------------------------------------------------------------------
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Save the object and the recipe, as plain tensors, numbers and strings."""

@@ -124,7 +124,7 @@ class CandidatePoses(CandidateSampler):
         proposes = "propose_poses" in method.capabilities
         if self.proposals and proposes:
             groups.append(method.propose_poses(encoding, self.proposals, generator))
-        own = torch.zeros(B, dtype=torch.bool, device=device)
+        at_persistent_sigma = torch.zeros(B, dtype=torch.bool, device=device)
         if self.persistent is not None:
             count = self.persistent.particles
             if proposes:
@@ -134,14 +134,16 @@ class CandidatePoses(CandidateSampler):
                 start = self.sigma_range[1]
             states, level = self.persistent.recall(batch, fresh, start)
             chance = torch.rand(B, device=device, generator=generator)
-            own = chance < self.persistent_sigma_probability
-            sigma = torch.where(own, level, sigma)
+            at_persistent_sigma = chance < self.persistent_sigma_probability
+            sigma = torch.where(at_persistent_sigma, level, sigma)
             groups.append(states)
         particles = make_particles(torch.cat(groups, dim=1), 0)
         output = method.measure(encoding, particles, Step(0, 1, sigma), generator)
         if self.persistent is not None:
             scores = output.log_likelihood[:, -self.persistent.particles :].detach()
-            self.persistent.advance(batch, states, scores, sigma, own, space, generator)
+            self.persistent.advance(
+                batch, states, scores, sigma, at_persistent_sigma, space, generator
+            )
         return one_step_trace(particles, output, sigma)
 
     def state(self) -> dict[str, Tensor]:
@@ -231,8 +233,10 @@ class LabeledRays(CandidateSampler):
         valid = drawn[:, :, None].expand(-1, -1, self.samples).flatten(1)
         near = (offset.abs() <= self.tolerance) & valid
         state = [
-            torch.cat([pixel, offset[..., None], torch.full_like(offset, own)[..., None]], -1)
-            for own in (0.0, 1.0)
+            torch.cat(
+                [pixel, offset[..., None], torch.full_like(offset, is_observed)[..., None]], -1
+            )
+            for is_observed in (0.0, 1.0)
         ]
         weight = torch.cat([valid, near], dim=1).float()
         scores = net.score_samples(torch.cat([point, point], 1), torch.cat([random, observed], 1))

@@ -182,8 +182,8 @@ class ImageSpace(PoseEstimator):
         corner = torch.tensor([W - 1, H - 1], device=state.device)
         pixel = nearest_pixel(state)
         inside = torch.minimum(pixel.clamp_min(0), corner)
-        z, known = gather_pixels(encoding.depth, inside).unbind(-1)
-        return back_project(state.detach(), z, encoding.intrinsics), (known > 0) & (
+        z, measured = gather_pixels(encoding.depth, inside).unbind(-1)
+        return back_project(state.detach(), z, encoding.intrinsics), (measured > 0) & (
             inside == pixel
         ).all(-1)
 
@@ -212,8 +212,8 @@ class ImageSpace(PoseEstimator):
         Returns:
             The chosen loss, the auxiliary losses and the objectness loss, (B,) each.
         """
-        own = self.train_filter is not self.filter
-        check_particle_counts(self.train_filter, "model.train_filter" if own else "filter")
+        name = "filter" if self.train_filter is self.filter else "model.train_filter"
+        check_particle_counts(self.train_filter, name)
         encoding = self.encode(batch)
         trace: Trace = self.train_filter(batch, with_encoding(self, encoding), generator)
         losses = {"loss": self.loss(trace, batch, self.object_model)}

@@ -127,10 +127,10 @@ class Keypoints(Hypotheses):
     ) -> np.ndarray:
         """Return one image's hypotheses (count, 4, 4); `default` (4, 4) where there is none."""
         sure = heights[:, 0] > _LEAST
-        found = [solve_pnp(points[sure], pixels[sure, 0], K, self.inlier_px)]
+        poses = [solve_pnp(points[sure], pixels[sure, 0], K, self.inlier_px)]
         for few, row in zip(chosen[1:], peaks[1:], strict=True):
-            found.append(solve_pnp(points[few], pixels[few, row[few]], K))
-        return np.stack([default if pose is None else pose for pose in found])
+            poses.append(solve_pnp(points[few], pixels[few, row[few]], K))
+        return np.stack([default if pose is None else pose for pose in poses])
 
     def fall_back(self, encoding: KeypointEncoding, pixels: Tensor) -> Tensor:
         """Return unturned poses 1 m deep whose centers are at pixels.  (B, 2) -> (B, 4, 4)."""
@@ -145,5 +145,5 @@ class Keypoints(Hypotheses):
         """
         pixels, ahead = project_keypoints(poses, encoding.keypoints, encoding.intrinsics)
         maps, places = encoding.maps.flatten(0, 1)[:, None], pixels.transpose(1, 2).flatten(0, 1)
-        seen = sample(maps, places, encoding.stride)[..., 0].unflatten(0, (len(poses), KEYPOINTS))
-        return (seen.transpose(1, 2) * ahead).mean(-1)
+        belief = sample(maps, places, encoding.stride)[..., 0].unflatten(0, (len(poses), KEYPOINTS))
+        return (belief.transpose(1, 2) * ahead).mean(-1)

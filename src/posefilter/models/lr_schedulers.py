@@ -6,7 +6,7 @@ from collections.abc import Callable
 from typing import Any
 
 from torch.optim import Optimizer
-from torch.optim.lr_scheduler import LambdaLR
+from torch.optim.lr_scheduler import LambdaLR, LRScheduler
 
 from posefilter.errors import UserError
 
@@ -36,6 +36,24 @@ def find_length(make: Callable[..., Any]) -> str | None:
                 f"given to a parameter {', '.join(LENGTHS[:-1])} or {LENGTHS[-1]}"
             )
     return length
+
+
+def start_schedule(make: Callable[..., LRScheduler], optimizer: Optimizer, trainer: Any) -> Any:
+    """Return the schedule of a training, over the trainer's number of steps where it needs one.
+
+    Raises:
+        UserError: It needs one, and the training has no end.
+    """
+    length = find_length(make)
+    if length is None:
+        return make(optimizer)
+    steps = trainer.estimated_stepping_batches
+    if not math.isfinite(steps):
+        raise UserError(
+            "trainer.max_steps=-1: the learning rate's schedule goes by the number of steps; "
+            "give it, or choose scheduler=none"
+        )
+    return make(optimizer, **{length: int(steps)})
 
 
 def warmup_cosine(

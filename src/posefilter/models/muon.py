@@ -45,10 +45,10 @@ class Muon(Optimizer):
         adam_layers: Sequence[str] = (),
     ) -> None:
         matrices: list[Tensor] = []
-        rest: list[Tensor] = []
+        adam_parameters: list[Tensor] = []
         for name, parameter in parameters:
             plain = parameter.dim() < 2 or bool(set(name.split(".")) & set(adam_layers))
-            (rest if plain else matrices).append(parameter)
+            (adam_parameters if plain else matrices).append(parameter)
         common = {
             "weight_decay": weight_decay,
             "momentum": momentum,
@@ -57,7 +57,7 @@ class Muon(Optimizer):
         }
         groups: list[dict[str, Any]] = [
             {"params": matrices, "lr": lr, "orthogonal": True},
-            {"params": rest, "lr": adam_lr, "orthogonal": False},
+            {"params": adam_parameters, "lr": adam_lr, "orthogonal": False},
         ]
         super().__init__([group for group in groups if group["params"]], common)
 

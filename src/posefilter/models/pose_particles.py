@@ -35,8 +35,8 @@ class PoseParticles(PoseEstimator):
     def space(self) -> PoseSpace:
         """SE(3) about the object's center."""
         if self._space is None:
-            own = self.object_model
-            self._space = PoseSpace(tuple(own.center.tolist()), own.radius, points=own.points)
+            model = self.object_model
+            self._space = PoseSpace(tuple(model.center.tolist()), model.radius, points=model.points)
         return self._space
 
     def set_object(self, object_model: ObjectModel) -> None:

@@ -9,6 +9,7 @@ from torch import Generator, Tensor, nn
 from posefilter.capabilities import Capabilities
 from posefilter.data.absent import hide_annotation
 from posefilter.filters.traces import map_tensors
+from posefilter.metrics.scores import InstanceErrors
 from posefilter.models.candidate_samplers import CandidateSampler
 from posefilter.models.pose_particles import PoseParticles, require_depth
 from posefilter.nets.coordinates import Cells, Coordinates, coordinate_loss
@@ -168,11 +169,11 @@ class PosePF(PoseParticles):
         """Return the losses of likelihood and proposal network, one value for each image."""
         encoding = self.encode(batch)
         count = self.likelihood_batch_size or len(batch.rgb)
-        part = Batch(*(x[:count] for x in batch))
+        subset = Batch(*(x[:count] for x in batch))
         image = encoding.image._replace(tables=None)  # whose rows are of all images
-        seen = map_tensors(lambda x: x[:count], encoding._replace(image=image))
-        candidates = self.candidate_sampler(self, seen, part, generator)
-        losses = {"likelihood": self.loss(candidates, part, self.object_model)}
+        subset_encoding = map_tensors(lambda x: x[:count], encoding._replace(image=image))
+        candidates = self.candidate_sampler(self, subset_encoding, subset, generator)
+        losses = {"likelihood": self.loss(candidates, subset, self.object_model)}
         if encoding.coordinates is not None and encoding.cells is not None:
             assert self.proposals is not None
             size = (self._center(), self.object_model.radius, float(self.proposals.reach))
@@ -180,9 +181,9 @@ class PosePF(PoseParticles):
                 encoding.coordinates, encoding.cells, batch.mask, batch.camera_from_object, *size
             )
             losses["proposals"] = self.proposal_weight * fit
-            known = error[error.isfinite()]
-            if len(known):
-                self.log_scalar("coordinate_error_mm", 1000 * known.mean())
+            finite = error[error.isfinite()]
+            if len(finite):
+                self.log_scalar("coordinate_error_mm", 1000 * finite.mean())
         return losses
 
     def set_object(self, object_model: ObjectModel) -> None:
@@ -208,18 +209,22 @@ class PosePF(PoseParticles):
         it.
         """
         super().update_metrics(trace, batch)
-        encoding = self.encode(hide_annotation(batch))
+        encoding = trace.encoding
+        if encoding is None:
+            encoding = self.encode(hide_annotation(batch))
         truth, best = batch.camera_from_object, trace.belief.best
-        known = best.isfinite().flatten(1).all(1)  # any other is a miss
-        best = torch.where(known[:, None, None], best, truth)
+        finite = best.isfinite().flatten(1).all(1)  # any other is a miss
+        best = torch.where(finite[:, None, None], best, truth)
         pair = torch.stack([best, truth], dim=1)
         generator = torch.Generator(device=self.device).manual_seed(self.seed)
         sigma = pair.new_tensor(self.comparison_sigma)
         scores = self._score(encoding, pair, sigma, generator, self.comparison_pixels)
-        outscored = known & (scores[:, 0] > scores[:, 1])
-        _, misplaced, diameter, error = self.scores["poses"].rows[-1].T  # of this batch
-        wrong = [outscored & (one > 0.1 * diameter) for one in (error, misplaced)]
-        for name, value in zip(_OUTSCORED, (outscored, *wrong), strict=True):
+        outscored = finite & (scores[:, 0] > scores[:, 1])
+        errors: InstanceErrors = self.scores["poses"].last()
+        limit = 0.1 * errors.diameter
+        wrong = outscored & (errors.add_up_to_symmetry > limit)
+        misplaced = outscored & (errors.add_s > limit)
+        for name, value in zip(_OUTSCORED, (outscored, wrong, misplaced), strict=True):
             self.scores[name].update(value.float())
 
     def compute_metrics(self) -> dict[str, Any]:

@@ -131,8 +131,8 @@ class RotationGrid(PoseParticles):
     def encode_views(self) -> None:
         """Encode the renders by the network as it is."""
         assert self.views is not None
-        parts = [self.net(part.to(self.codes)) for part in self.views.split(_CHUNK)]
-        self.codes.copy_(torch.cat(parts))
+        codes = [self.net(part.to(self.codes)) for part in self.views.split(_CHUNK)]
+        self.codes.copy_(torch.cat(codes))
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Save the codes of the network as it is, not of the last validation."""
@@ -150,11 +150,11 @@ class RotationGrid(PoseParticles):
 
     def encode_crops(self, encoding: CropEncoding, centers: Tensor) -> Tensor:
         """Return the codes of the crops about points.  (B, N, 3) [m] -> (B, N, width)."""
-        parts = [
+        codes = [
             self.net(self.crop(encoding, part).flatten(0, 1)).unflatten(0, part.shape[:2])
             for part in centers.split(max(1, _CHUNK // len(centers)), dim=1)
         ]
-        return torch.cat(parts, dim=1)
+        return torch.cat(codes, dim=1)
 
     def crop(self, encoding: CropEncoding, centers: Tensor) -> Tensor:
         """Return the crops about points.  (B, N, 3) [m] -> (B, N, 5, side, side)."""
@@ -189,8 +189,8 @@ class RotationGrid(PoseParticles):
         """
         places = origin_of(poses, self.object_model.center.to(poses))
         codes = self.encode_crops(encoding, places)
-        seen = look_at(places).mT @ rotation_of(poses)
-        index, share = self.find_cells(seen)
+        rotation = look_at(places).mT @ rotation_of(poses)
+        index, share = self.find_cells(rotation)
         near = self.codes[index]  # (B, N, k, width)
         return self.net.scale * ((near @ codes[..., None])[..., 0] * share).sum(-1)
 
@@ -216,8 +216,8 @@ class RotationGrid(PoseParticles):
         cells = self.draw_cells(batch, generator)
         crops = self.crop(self.encode(batch), centers).flatten(0, 1)
         codes = self.net(torch.cat([crops, self.views[cells.cpu()].to(crops)]))
-        seen, known = codes.split([len(crops), len(cells)])
-        scores = self.net.scale * (seen @ known.T).unflatten(0, centers.shape[:2])
+        crop_codes, view_codes = codes.split([len(crops), len(cells)])
+        scores = self.net.scale * (crop_codes @ view_codes.T).unflatten(0, centers.shape[:2])
         encoding = TrainingEncoding(scores, centers, self.grid[cells])
         return {"loss": self.measure_encoding_loss(encoding, batch)}
 
@@ -238,8 +238,8 @@ class RotationGrid(PoseParticles):
     def draw_cells(self, batch: Batch, generator: Generator) -> Tensor:
         """Return cells to score against: those nearest to each truth, and any.  -> (M,) int64."""
         center = origin_of(batch.camera_from_object, self.object_model.center.to(batch.depth))
-        seen = look_at(center).mT @ rotation_of(batch.camera_from_object)
-        near = self.find_cells(seen, self.near_cells)[0].flatten()
+        rotation = look_at(center).mT @ rotation_of(batch.camera_from_object)
+        near = self.find_cells(rotation, self.near_cells)[0].flatten()
         count = max(self.train_cells - len(near), self.train_cells // 4)
         any_cells = torch.randint(len(self.grid), (count,), generator=generator, device=near.device)
         return torch.cat([near, any_cells])

@@ -18,6 +18,7 @@ from torch import Generator, Tensor
 
 from posefilter.confidence.second_look import LEAST_DEPTH, measure_worth, read_objectness
 from posefilter.data.resize import resize_depth
+from posefilter.errors import UserError
 from posefilter.filters.loop import ParticleFilter
 from posefilter.filters.traces import map_traces
 from posefilter.geometry.camera import project, resize_intrinsics
@@ -43,6 +44,22 @@ def with_encoding(method: Any, encoding: Encoding) -> Any:
     vars(out).update(vars(method))  # with its trainer, which Lightning leaves out of copies
     out.encode = lambda batch: encoding
     return out
+
+
+def check_zoom(method: Any) -> None:
+    """Raise UserError where windows are asked of a method or a filter that cannot search them."""
+    if getattr(method.filter, "zoom_diameter", None) is None:
+        return
+    if "pose_space" not in method.capabilities:
+        raise UserError(
+            "filter.zoom_diameter: needs a method whose particles are poses, such as "
+            f"pose_pf; those of {type(method).__name__} are places in one image"
+        )
+    if type(method.filter).forward is not ParticleFilter.forward:
+        raise UserError(
+            f"filter.zoom_diameter: {type(method.filter).__name__} has a forward() of its "
+            "own, which windows would not run; choose null"
+        )
 
 
 def search(
@@ -113,16 +130,16 @@ def choose_part(method: Any, image: Batch) -> Batch | None:
     ]
     pixels = image.intrinsics.new_tensor(centers)
     copies = Batch(*(x.expand(len(pixels), *x.shape[1:]) for x in image))
-    parts = magnify(copies, pixels, pixels.new_full((len(pixels),), PART_ZOOM))
-    known = _has_depth(parts)
-    if not known.any():
+    windows = magnify(copies, pixels, pixels.new_full((len(pixels),), PART_ZOOM))
+    has_depth = _has_depth(windows)
+    if not has_depth.any():
         return None
-    parts = select(parts, known)
-    encoding = method.encode(parts)
+    windows = select(windows, has_depth)
+    encoding = method.encode(windows)
     if read_objectness(encoding) is None:
         return None
     surest = int(measure_worth(encoding).argmax())
-    return Batch(*(x[surest : surest + 1] for x in parts))
+    return Batch(*(x[surest : surest + 1] for x in windows))
 
 
 def find_place(particles: Particles, object_model: ObjectModel) -> tuple[Tensor, Tensor]:
@@ -135,8 +152,8 @@ def find_place(particles: Particles, object_model: ObjectModel) -> tuple[Tensor,
     about = centers.gather(1, heaviest[..., None].expand(-1, -1, 3))
     near = torch.cdist(about, centers) < object_model.diameter / 2  # (B, M, N)
     most, index = (near * weights[:, None]).sum(-1).max(1)
-    own = near[torch.arange(len(index), device=index.device), index] * weights
-    mean = (own[..., None] * centers).sum(1) / own.sum(1, keepdim=True)
+    near_weights = near[torch.arange(len(index), device=index.device), index] * weights
+    mean = (near_weights[..., None] * centers).sum(1) / near_weights.sum(1, keepdim=True)
     return mean, most
 
 
@@ -168,8 +185,8 @@ def _has_depth(view: Batch) -> Tensor:
     """Return in which images there is depth to start from, (B,) bool: in some pixels, and in one of
     the proposal network's cells.
     """
-    known = (view.depth > 0).flatten(1).float().mean(1) >= LEAST_DEPTH
-    return known & measure_cells(view.depth, view.intrinsics).valid.flatten(1).any(1)
+    enough = (view.depth > 0).flatten(1).float().mean(1) >= LEAST_DEPTH
+    return enough & measure_cells(view.depth, view.intrinsics).valid.flatten(1).any(1)
 
 
 def magnify(batch: Batch, pixels: Tensor, zoom: Tensor) -> Batch:

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 from posefilter.errors import UserError
 from posefilter.figures.layout import format_length
-from posefilter.metrics.image_errors import FILE, ImageError, summarize_errors
+from posefilter.metrics.image_errors import FILE, ImageError, summarize_images
 from posefilter.metrics.registry import find_metric
 from posefilter.report.blocks import (
     Block,
@@ -206,7 +206,7 @@ def list_verdict(pairs: Sequence[Pair], names: tuple[str, str]) -> list[Block]:
 
 def tabulate_common(rows: dict[str, list[ImageError]]) -> Table:
     """Return the metrics of both runs on the common images, and their difference."""
-    found = [summarize_errors(own) for own in rows.values()]
+    found = [summarize_images(own) for own in rows.values()]
     cells: list[list[Cell]] = []
     for kind, name in product(("add", "add_s"), found[0]["add"]):
         info = find_metric(f"{kind}/{name}")
