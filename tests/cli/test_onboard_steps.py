@@ -213,6 +213,7 @@ def test_another_texture_mapping_is_another_mesh(tmp_path: Path) -> None:
         ("trainer.max_steps=300", "steps= sets the number"),
         ("+trainer.val_check_interval=5", "trainer.val_check_interval follows from"),
         ("filter.partcles=20", "filter.partcles: there is no such setting"),
+        ("filter.partcles=${filter.steps}", "filter.partcles: there is no such setting"),
     ],
 )
 def test_mistakes_in_overrides_are_told_before_anything_is_written(
@@ -252,8 +253,10 @@ def test_a_folder_may_have_any_name(tmp_path: Path) -> None:
     cfg = OmegaConf.load(find_conf() / "onboard.yaml")
     assert isinstance(cfg, DictConfig)
     cfg.warm_start = "Mike's.ckpt"
+    cfg.train_overrides = ["filter.initial_particles=${filter.particles}"]  # of the training's
     mesh = build("brick")
     training = Onboarding(cfg, mesh, out, Stages(out / "onboarding.json", {})).job(out / "training")
     assert training.cfg.data.root == str(out / "data")
     assert training.cfg.data.meshes == str(out / "meshes")
     assert training.cfg.warm_start == "Mike's.ckpt"
+    assert training.cfg.filter.initial_particles == training.cfg.filter.particles

@@ -28,7 +28,7 @@ from posefilter.cli.job import Job, write_job
 from posefilter.cli.machine import settle
 from posefilter.cli.measure_speed import Speed, measure_speed
 from posefilter.cli.onboarded_mesh import find_and_draw, find_declared, read_onboarded, write_meshes
-from posefilter.cli.plain import key_of, resolve
+from posefilter.cli.plain import key_of, resolve, unresolved
 from posefilter.cli.report import compared, write_page
 from posefilter.cli.resume import LAST
 from posefilter.cli.reuse import step_of
@@ -130,6 +130,7 @@ class Onboarding:
     def settings_of(self, stage: Stage) -> dict[str, Any]:
         """Return all that decides a stage's result."""
         known = {**self.digests, "frames": self.frames, "name": self.mesh.name}
+        known["train_overrides"] = unresolved(self.cfg.get("train_overrides"))
         return {
             key: known[key] if key in known else resolve(self.cfg.get(key))
             for key in stage.settings
@@ -170,7 +171,7 @@ class Onboarding:
             words.append("warm_start=[" + ",".join(map(quote, start)) + "]")
         elif start is not None:
             words.append(f"warm_start={quote(start)}")
-        words += [*map(str, self.cfg.train_overrides), *more]
+        words += [*unresolved(self.cfg.train_overrides), *more]
         return replace(compose_job("train", find_conf(), words, folder), swept=True)
 
     @cached_property
@@ -252,7 +253,7 @@ def onboard(job: Job) -> None:
     cfg = job.cfg
     settle(cfg.threads, cfg.seed)
     if cfg.train_overrides:  # a mistake in them is told before anything is written
-        overrides = [*map(str, cfg.train_overrides)]
+        overrides = unresolved(cfg.train_overrides)
         for key in ("trainer.max_steps", "trainer.val_check_interval"):
             if key in map(key_of, overrides):
                 raise UserError(
