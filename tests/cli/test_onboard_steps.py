@@ -176,6 +176,8 @@ def test_what_is_left_of_a_rendering_that_was_interrupted_is_known(
     work.stages.keep(seconds_per_frame=0.5)
     # 150 frames, the fewest steps, and what follows
     assert work.seconds_left == 150 * 0.5 + 100 + (350 + 68) * 0.5 + 25
+    work.cfg.train_overrides = ["filter.particles=500"]  # which may be slower
+    assert work.speed is None
 
 
 @pytest.mark.parametrize("console", ["rich", "json"])

@@ -185,7 +185,10 @@ class Onboarding:
 
     @property
     def speed(self) -> Speed | None:
-        """Of the training, as it was measured; None: not yet."""
+        """Of the training, as it was measured; None: not yet, or with other `train_overrides`."""
+        own = unresolved(self.cfg.get("train_overrides"))
+        if self.stages.values.get("measured_with", own) != own:
+            return None
         step, image = (self.stages.values.get(name) for name in _SPEED)
         return None if step is None or image is None else Speed(step, image)
 
@@ -346,7 +349,11 @@ def measure(work: Onboarding, job: Job, began: float) -> None:
     """
     say(work.cfg.console, "measuring", "measuring the time of a step and of an image")
     speed = measure_speed(job)
-    work.stages.keep(seconds_per_step=speed.step, seconds_per_image=speed.image)
+    work.stages.keep(
+        seconds_per_step=speed.step,
+        seconds_per_image=speed.image,
+        measured_with=unresolved(work.cfg.get("train_overrides")),
+    )
     spent = work.spent + time.perf_counter() - began
     least = spent + work.to_render + _FEWEST_STEPS * speed.step + work.rest(speed)
     if work.cfg.steps is None and least > work.budget:
@@ -366,7 +373,7 @@ def train(work: Onboarding) -> None:
     values, console = work.stages.values, work.cfg.console
     if values.get("steps") is None:
         began = time.perf_counter()
-        if work.speed is None:  # rendered by an earlier version
+        if work.speed is None:  # rendered by an earlier version, or other settings since
             measure(work, work.job(work.out / ".trial"), began)
         assert work.speed is not None
         steps, seconds = work.plan(work.speed, work.spent + time.perf_counter() - began)
