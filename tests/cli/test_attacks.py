@@ -160,9 +160,12 @@ def test_damaged_metrics_are_one_line(tmp_path: Path) -> None:
     assert read_metrics(file) == {"iou": 0.5}
 
 
-def test_a_launcher_that_fails_is_named() -> None:
-    """And no other choice is blamed, as it is where Hydra's own code fails."""
-    typed = ["debug=smoke", "hydra/launcher=submitit_slurm", "seed=0,1"]
+def test_a_launcher_that_fails_is_named(tmp_path: Path) -> None:
+    """And no other choice, nor a folder of one's own, is blamed, as it is where Hydra's own code
+    fails.
+    """
+    folder = ["--config-dir", str(tmp_path)]
+    typed = [*folder, "debug=smoke", "hydra/launcher=submitit_slurm", "seed=0,1"]
     for file, told in (
         ("/x/hydra_plugins/y.py", "hydra/launcher=submitit_slurm: has failed (no srun)"),
         ("/x/hydra/y.py", "debug=smoke: cannot be read (no srun)"),

@@ -17,7 +17,7 @@ from posefilter.cli.evaluate import data_settings
 from posefilter.cli.generate import generate
 from posefilter.cli.plain import to_plain
 from posefilter.cli.train import places
-from posefilter.errors import ProblemsFound, UserError
+from posefilter.errors import ProblemsFound, Stopped, UserError
 
 HOME = Path(__file__).parents[2]
 CONF = HOME / "conf"
@@ -156,6 +156,25 @@ def test_an_evaluation_is_told_what_no_checkpoint_decides(tmp_path: Path) -> Non
         rest = [word for word in given if word != left_out]
         with pytest.raises(UserError, match=r"data\.(root|cache|options\.frames|split\.test)="):
             data_settings(compose_job("evaluate", CONF, rest, tmp_path), trained, None)
+
+
+@pytest.mark.parametrize(
+    ("stop", "told"), [(KeyboardInterrupt(), "interrupted"), (Stopped(15), "stopped by SIGTERM")]
+)
+def test_a_rendering_that_was_interrupted_says_how_it_goes_on(
+    stop: BaseException,
+    told: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    def interrupt(*_: object) -> None:
+        raise stop
+
+    monkeypatch.setattr("posefilter.cli.generate.instantiate", interrupt)
+    assert run_command("generate", HOME, [f"out={tmp_path}", "object=carton"]) > 128
+    (said,) = capsys.readouterr().err.splitlines()
+    assert said == f"generate: {told}; give the same command again to go on from there"
 
 
 def test_one_frame_can_be_generated(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -2,6 +2,7 @@
 left is the time of the stages that are not done.
 """
 
+import json
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -9,6 +10,7 @@ from types import SimpleNamespace
 import pytest
 from omegaconf import DictConfig, OmegaConf
 
+from posefilter.cli import calibrate as calibration
 from posefilter.cli import onboard as command
 from posefilter.cli import run_command
 from posefilter.cli.measure_speed import Speed
@@ -80,6 +82,119 @@ def test_the_time_of_measuring_is_not_given_to_the_training(
     assert len(run.callbacks) == 1  # which keeps to it
 
 
+@pytest.fixture
+def rendering(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[float]:
+    """Have a frame take half a second, a step 1 s and an image 0.5 s; return the clock [s]."""
+    now = [0.0]
+
+    def build_data(data: DictConfig, console: str) -> None:
+        for i in range(command.count_frames(tmp_path / "data"), data.frames):
+            file = tmp_path / "data" / "mixed" / "scene0_0" / f"{i:06d}.left.json"
+            file.parent.mkdir(parents=True, exist_ok=True)
+            file.touch()
+            now[0] += 0.5
+
+    def make_job(work: Onboarding, folder: Path, frames: int | None = None) -> SimpleNamespace:
+        data = OmegaConf.create({"frames": frames or work.frames})
+        return SimpleNamespace(cfg=SimpleNamespace(data=data), folder=folder)
+
+    monkeypatch.setattr("time.perf_counter", lambda: now[0])
+    monkeypatch.setattr(command, "build_data", build_data)
+    monkeypatch.setattr(command, "measure_speed", lambda job: Speed(step=1.0, image=0.5))
+    monkeypatch.setattr(Onboarding, "job", make_job)
+    return now
+
+
+def start(folder: Path, budget: float, **more: object) -> Onboarding:
+    """Return an onboarding whose first two stages are done."""
+    settings = {"frames": None, "test_frames": 60, "steps": None, "console": "rich", **more}
+    settings["symmetries"] = "none"
+    cfg = OmegaConf.create({**settings, "budget_minutes": budget})
+    work = Onboarding(cfg, build(names()[0]), folder, Stages(folder / "record.json"))
+    for stage in STAGES[:2]:
+        work.stages.run(stage.name, work.settings_of(stage), lambda: None)
+    return work
+
+
+# 350 frames of 0.5 s, 100 steps of 1 s, 350 images of the calibration and 68 of the tests of 0.5 s,
+# and 25 s for the rest: 509 s
+@pytest.mark.parametrize(("budget", "more"), [(3.5, {}), (8.4, {"frames": 350})])
+def test_a_budget_that_does_not_hold_the_least_is_told_early(
+    budget: float,
+    more: dict[str, object],
+    tmp_path: Path,
+    rendering: list[float],
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    seen = []
+
+    def measure(job: object) -> Speed:
+        seen.append(command.count_frames(tmp_path / "data"))
+        return Speed(step=1.0, image=0.5)
+
+    monkeypatch.setattr(command, "measure_speed", measure)
+    command.render(start(tmp_path, budget, **more))
+    assert seen == [200]  # before the others are rendered
+    (said,) = [one for one in capsys.readouterr().out.splitlines() if one.startswith("warning")]
+    assert f"budget_minutes={budget:g} is too short on this machine" in said
+    assert "take about 8 min 29 s" in said
+    assert said.endswith("budget_minutes=8.5 frames=350")
+
+
+@pytest.mark.parametrize(("budget", "more"), [(8.5, {"frames": 350}), (3.5, {"steps": 2000})])
+def test_a_budget_that_holds_the_least_is_not_told_of(
+    budget: float,
+    more: dict[str, object],
+    tmp_path: Path,
+    rendering: list[float],
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    work = start(tmp_path, budget, **more)
+    command.render(work)
+    assert "warning" not in capsys.readouterr().out
+    assert work.speed == Speed(step=1.0, image=0.5)
+
+
+def test_what_is_left_of_a_rendering_that_was_interrupted_is_known(
+    tmp_path: Path, rendering: list[float], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    work = start(tmp_path, 3.5)
+    assert work.seconds_left == 3.5 * 60  # of the budget
+    stage = next(one for one in STAGES if one.name == "render")
+
+    def interrupt(job: object) -> Speed:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(command, "measure_speed", interrupt)
+        with pytest.raises(KeyboardInterrupt):
+            work.stages.run(stage.name, work.settings_of(stage), lambda: stage.do(work))
+    assert work.seconds_left == 3.5 * 60 - 200 * 0.5
+    monkeypatch.setattr(command, "build_data", lambda *_: None)  # interrupted before it goes on
+    command.render(work)
+    work.stages.keep(seconds_per_frame=0.5)
+    # 150 frames, the fewest steps, and what follows
+    assert work.seconds_left == 150 * 0.5 + 100 + (350 + 68) * 0.5 + 25
+    work.cfg.train_overrides = ["filter.particles=500"]  # which may be slower
+    assert work.speed is None
+
+
+@pytest.mark.parametrize("console", ["rich", "json"])
+def test_a_calibration_tells_how_far_it_is_where_no_bar_is_seen(
+    console: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    now = [0.0]
+    monkeypatch.setattr("time.perf_counter", lambda: now[0])
+    for _ in calibration._told(range(10), 10, console):
+        now[0] += 20.0
+    said = capsys.readouterr().out.splitlines()
+    assert len(said) == 4  # every 40 s of 180
+    first = {"event": "estimating", "batch": 2, "batches": 10}
+    told = "estimating: batch 2 of 10, 2 min 40 s left of this pass"
+    assert said[0] == (told if console == "rich" else json.dumps(first))
+
+
 def test_another_texture_mapping_is_another_mesh(tmp_path: Path) -> None:
     cfg = OmegaConf.create({"frames": 400})
     mesh = build("carton")
@@ -100,6 +215,7 @@ def test_another_texture_mapping_is_another_mesh(tmp_path: Path) -> None:
         ("trainer.max_steps=300", "steps= sets the number"),
         ("+trainer.val_check_interval=5", "trainer.val_check_interval follows from"),
         ("filter.partcles=20", "filter.partcles: there is no such setting"),
+        ("filter.partcles=${filter.steps}", "filter.partcles: there is no such setting"),
     ],
 )
 def test_mistakes_in_overrides_are_told_before_anything_is_written(
@@ -139,8 +255,10 @@ def test_a_folder_may_have_any_name(tmp_path: Path) -> None:
     cfg = OmegaConf.load(find_conf() / "onboard.yaml")
     assert isinstance(cfg, DictConfig)
     cfg.warm_start = "Mike's.ckpt"
+    cfg.train_overrides = ["filter.initial_particles=${filter.particles}"]  # of the training's
     mesh = build("brick")
     training = Onboarding(cfg, mesh, out, Stages(out / "onboarding.json", {})).job(out / "training")
     assert training.cfg.data.root == str(out / "data")
     assert training.cfg.data.meshes == str(out / "meshes")
     assert training.cfg.warm_start == "Mike's.ckpt"
+    assert training.cfg.filter.initial_particles == training.cfg.filter.particles

@@ -146,6 +146,37 @@ def own_folder(tmp_path: Path) -> Path:
     return file.parents[1]
 
 
+def test_a_method_whose_file_chooses_no_loss_is_told(
+    package: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    file = tmp_path / "own" / "model" / "mine.yaml"
+    file.parent.mkdir(parents=True)
+    file.write_text(
+        "# @package _global_\n"
+        "defaults: [/model/_base, /preset/_pixels, /filter/resample: none, _self_]\n"
+        "model: {_target_: ownpf.method.OwnScore}\n"
+    )
+    typed = ["--config-dir", str(tmp_path / "own"), "model=mine", f"out={tmp_path}/run"]
+    assert run_command("train", HOME, [*typed, "console=json"]) == 2
+    (said,) = capfd.readouterr().err.strip().splitlines()
+    assert said == (
+        "train: loss: nothing chooses one; type loss=NAME, or add `- /loss: NAME` to the defaults "
+        "in the file of model=mine"
+    )
+
+
+def test_the_bases_of_a_method_of_ones_own_choose_all_but_what_differs(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.syspath_prepend(HOME / "examples" / "plugin")
+    monkeypatch.setattr(trust, "_trusted", {"posefilter_example"})
+    for name, more in {"color_walk": [], "depth_fit": ["data/augment=strong"]}.items():
+        job = compose_job("train", CONF, [f"model={name}", "optimizer=adamw", *more], tmp_path)
+        check_fit(job.cfg, job.choices, Scope.CONFIG)
+        assert job.choices["optimizer"] == "adamw"
+        assert job.choices["data/augment"] == ("strong" if more else "none")
+
+
 def test_a_choice_with_the_name_of_another_is_refused(
     own_folder: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:

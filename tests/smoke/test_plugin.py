@@ -91,6 +91,18 @@ def test_method_reader_and_loss_of_ones_own(
     assert "loss=add does not fit model=color_walk" in capfd.readouterr().err
 
 
+@pytest.mark.slow
+def test_a_method_of_ones_own_whose_particles_are_poses(
+    tiny_scenes: Path, tmp_path: Path, forget_trust: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.syspath_prepend(str(PLUGIN))
+    assert train(tiny_scenes, tmp_path / "run", "model=depth_fit", "trainer.max_steps=4") == 0
+    metrics = json.loads((tmp_path / "run" / "metrics.json").read_text())
+    assert metrics["add"]["auc"] >= 0
+    drawn = {file.stem.removeprefix("validation_") for file in (tmp_path / "run").rglob("*.jpg")}
+    assert "belief" in drawn  # it said that its particles are poses
+
+
 @pytest.fixture
 def entry_point(tmp_path: Path) -> Path:
     """Return a folder that says, as pip does, that the example is installed."""

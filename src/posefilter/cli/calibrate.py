@@ -3,9 +3,11 @@ frames with the object and without.
 """
 
 import math
-from collections.abc import Sequence
+import sys
+import time
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 import torch
@@ -14,7 +16,7 @@ from torch import Tensor
 from posefilter.cli.build import build_data
 from posefilter.cli.checkpoints import find_checkpoint, method_of, read_checkpoint
 from posefilter.cli.components import changes
-from posefilter.cli.console import JSON, ended, show_table, typed, typed_prediction
+from posefilter.cli.console import JSON, ended, say, show_table, typed, typed_prediction
 from posefilter.cli.evaluate import data_settings
 from posefilter.cli.files import save_whole
 from posefilter.cli.job import Job
@@ -52,9 +54,12 @@ from posefilter.metrics.credibility import score_truth
 from posefilter.metrics.registry import find_metric
 from posefilter.models.base import PoseEstimator
 from posefilter.progress import watched
+from posefilter.report.diagnostics import format_duration
 from posefilter.types import Batch, BeliefBatch, ObjectModel, Trace
 
 _BATCH = 8  # images
+_PAUSE = 30.0  # between lines of progress [s]
+_Item = TypeVar("_Item")
 _SHOWN = ("auroc", "auroc_presence", "ece", "brier", "found", "false_alarms")
 
 
@@ -97,8 +102,7 @@ def calibrate(job: Job) -> None:
             f"and {FEWEST} are needed; render some, and name their folder: absent=DIR ("
             f"{typed('generate', out='DIR', object=name, absent_fraction=1, frames=60)} meshes=...)"
         )
-    shown = cfg.console != JSON
-    calibration = learn(method, [data.val_dataset], absent, data.source, shown)
+    calibration = learn(method, [data.val_dataset], absent, data.source, cfg.console)
     save_whole({**checkpoint, "calibration": calibration.to_plain()}, out)
     tell(job, method, calibration, out)
 
@@ -136,7 +140,7 @@ def collect_frames(
     method: PoseEstimator,
     present: Sequence[FrameDataset],
     absent: Sequence[FrameDataset],
-    shown: bool = False,
+    console: str,
     first_answers: Sequence[FirstAnswers] = (),
 ) -> tuple[Frames, Beliefs, list[FirstAnswers]]:
     """Run a filter on frames with the object and without, and return what speaks for each
@@ -146,7 +150,7 @@ def collect_frames(
         method: A method with its weights; calibrated, it searches again where it doubts.
         present: Frames with the object.
         absent: Frames without.
-        shown: Draw a bar.
+        console: "rich" or "json".
         first_answers: Those of an earlier call with the same frames, which are not searched for
             again: estimates, and the draws of other searches, stay what they would be.
     """
@@ -156,7 +160,7 @@ def collect_frames(
     count = sum(len(loader) for loader, _ in loaders)
     # batch after batch: all of a thousand frames would take gigabytes
     batches = ((batch, is_there) for loader, is_there in loaders for batch in loader)
-    for number, (batch, is_there) in enumerate(watched(batches, count, "estimating", shown)):
+    for number, (batch, is_there) in enumerate(_told(batches, count, console)):
         truth = batch.camera_from_object
         seen = Batch(*(x.to(method.device) for x in hide_annotation(batch)))
         with torch.no_grad():
@@ -183,12 +187,25 @@ def collect_frames(
     return make_frames(values, there, errors), Beliefs(BeliefBatch(*own), truths), answers
 
 
+def _told(items: Iterable[_Item], count: int, console: str) -> Iterator[_Item]:
+    """Yield batches, `count` of them: on a terminal under a bar, else with a line now and then."""
+    began = last = time.perf_counter()
+    has_bar = console != JSON and sys.stdout.isatty()
+    for done, item in enumerate(watched(items, count, "estimating", has_bar)):
+        now = time.perf_counter()
+        if done and now - last >= _PAUSE and not has_bar:
+            last, left = now, format_duration((now - began) / done * (count - done))
+            said = f"estimating: batch {done} of {count}, {left} left of this pass"
+            say(console, "estimating", said, batch=done, batches=count)
+        yield item
+
+
 def learn(
     method: PoseEstimator,
     present: Sequence[FrameDataset],
     absent: Sequence[FrameDataset],
     source: str,
-    shown: bool = False,
+    console: str,
 ) -> Calibration:
     """Return the calibration of a method, with its quality on held-out parts of the frames.
 
@@ -201,13 +218,13 @@ def learn(
         present: Frames with the object.
         absent: Frames without.
         source: The kind of data that they are of.
-        shown: Draw bars.
+        console: "rich" or "json".
     """
     method.calibration, first = None, None
-    frames, beliefs, answers = collect_frames(method, present, absent, shown)
+    frames, beliefs, answers = collect_frames(method, present, absent, console)
     if method.filter.max_searches > 1:
         method.calibration = first = fit_choice(frames, source)
-        frames, beliefs, _ = collect_frames(method, present, absent, shown, answers)
+        frames, beliefs, _ = collect_frames(method, present, absent, console, answers)
     held = cross_validate(frames, first=first)
     scores = measure_quality(frames, held)
     quality = {key: float(scores[key]) for key in _SHOWN if math.isfinite(scores[key])}

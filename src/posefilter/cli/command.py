@@ -61,6 +61,7 @@ from posefilter.ranges import check_ranges
 from posefilter.signals import stopped_by_sigterm
 
 _IN_PROCESSES = ("train", "onboard")  # commands that can be several processes of one training
+_RESUMED = ("generate", "onboard")  # when they are typed again
 _FAILED = (FloatingPointError, ProblemsFound, NotThere)  # nothing is wrong with the command line
 
 
@@ -125,10 +126,10 @@ def run_command(name: str, home: Path | None = None, arguments: list[str] | None
                 f"{kept[0].folder}"
             )
     except KeyboardInterrupt:
-        print(f"{name}: interrupted", file=sys.stderr)
+        print(f"{name}: interrupted{_tell_resumed(name)}", file=sys.stderr)
         return INTERRUPTED
     except Stopped as stopped:
-        print(f"{name}: {stopped}", file=sys.stderr)
+        print(f"{name}: {stopped}{_tell_resumed(name)}", file=sys.stderr)
         return 128 + stopped.number
     except (Carrier, *EXPECTED) as caught:
         error = caught.args[0] if isinstance(caught, Carrier) else caught
@@ -149,6 +150,11 @@ def run_command(name: str, home: Path | None = None, arguments: list[str] | None
         os.environ.update({} if started is None else {STARTED: started})
         release_all()
     return 0
+
+
+def _tell_resumed(name: str) -> str:
+    """Return how a command that was interrupted goes on, of those that resume by themselves."""
+    return "; give the same command again to go on from there" if name in _RESUMED else ""
 
 
 def write_record(record: Mapping[Path, bytes]) -> None:

@@ -136,7 +136,7 @@ def explain_hydra(error: BaseException, conf: Path, arguments: list[str]) -> str
         chosen = [a for a in arguments if a.startswith(("hydra/launcher=", "hydra/sweeper="))]
         return f"{', '.join(chosen) or 'the sweep'}: has failed ({first_line(error)})"
     # a choice that is null or a number, and the like
-    groups = [a for a in arguments if (conf / key_of(a)).is_dir()]
+    groups = [a for a in arguments if "=" in a and (conf / key_of(a)).is_dir()]
     wrong = next((a for a in groups if a.partition("=")[2].lower() in ("true", "false")), None)
     if wrong is not None:
         known = list_choices(conf / key_of(wrong))

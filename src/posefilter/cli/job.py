@@ -154,12 +154,13 @@ def _resolve(cfg: DictConfig) -> dict[str, Any]:
     return out
 
 
-def check_settings(cfg: DictConfig, command: str) -> None:
+def check_settings(cfg: DictConfig, command: str, choices: Mapping[str, str] | None = None) -> None:
     """Check what needs nothing but the settings, before torch is imported.
 
     Args:
         cfg: The settings.
         command: The command's name.
+        choices: Which file of each group; None: not known.
 
     Raises:
         UserError: A number is outside of its range, or another setting makes no sense.
@@ -168,6 +169,11 @@ def check_settings(cfg: DictConfig, command: str) -> None:
     check_ranges(plain, command)
     check_out(cfg)
     for key in _NEEDED.get(command, ()):
+        if choices is not None and key not in plain and key not in choices:
+            raise UserError(
+                f"{key}: nothing chooses one; type {key}=NAME, or add `- /{key}: NAME` to the "
+                f"defaults in the file of model={choices.get('model')}"
+            )
         if plain.get(key) is None:
             raise UserError(f"{key}=null: {command} requires a value; leave it out for the default")
     check_ranges(_resolve(cfg), command)  # what is made of other settings, too

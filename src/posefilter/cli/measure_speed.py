@@ -32,7 +32,8 @@ def measure_speed(job: Job) -> Speed:
     enough = (_STEPS + 1) * cfg.data.batch_size  # frames that are decoded for it
     cfg.data.limit_train = min(enough, cfg.data.limit_train or enough)
     cfg.data.limit_val = 1
-    trial = replace(job, cfg=cfg, swept=False)
+    # as if nothing were typed: there may be more renders than it needs
+    trial = replace(job, cfg=cfg, overrides=[], swept=False)
     times = list[float]()
     clock = LambdaCallback(on_train_batch_end=lambda *_: times.append(time.perf_counter()))
     try:

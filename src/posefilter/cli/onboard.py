@@ -20,7 +20,7 @@ from posefilter.cli.calibrate import learn
 from posefilter.cli.checkpoints import method_of, read_checkpoint
 from posefilter.cli.choices import check_choices
 from posefilter.cli.command import compose_job
-from posefilter.cli.console import JSON, ended, say, typed, typed_prediction
+from posefilter.cli.console import ended, say, typed, typed_prediction, warn
 from posefilter.cli.export import strip, write_weights
 from posefilter.cli.files import save_whole
 from posefilter.cli.folders import hold_folder
@@ -28,7 +28,7 @@ from posefilter.cli.job import Job, write_job
 from posefilter.cli.machine import settle
 from posefilter.cli.measure_speed import Speed, measure_speed
 from posefilter.cli.onboarded_mesh import find_and_draw, find_declared, read_onboarded, write_meshes
-from posefilter.cli.plain import key_of, resolve
+from posefilter.cli.plain import key_of, resolve, unresolved
 from posefilter.cli.report import compared, write_page
 from posefilter.cli.resume import LAST
 from posefilter.cli.reuse import step_of
@@ -46,8 +46,9 @@ from posefilter.report.gather import read_json, read_run
 from posefilter.report.onboarding_page import make_onboarding_page
 
 RECORD = "onboarding.json"
-_SPEED = ("steps", "seconds_per_step", "seconds_per_image")  # known once the training begins
-FOUND = {**dict.fromkeys(_SPEED, NUMBER), "concerns": [TEXT], "facts": {}, "training": {}}
+_SPEED = ("seconds_per_step", "seconds_per_image")  # known once some frames are rendered
+_PLANNED = ("steps", *_SPEED, "seconds_per_frame")  # the steps, once the training begins
+FOUND = {**dict.fromkeys(_PLANNED, NUMBER), "concerns": [TEXT], "facts": {}, "training": {}}
 _FRAMES_A_MINUTE, _FEWEST_FRAMES, _MOST_FRAMES = 100, 200, 4000
 _FEWEST_STEPS, _MOST_STEPS = 100, 8000
 # Rendered, at most, as those in which enough of the object is seen are fewer.
@@ -129,13 +130,21 @@ class Onboarding:
     def settings_of(self, stage: Stage) -> dict[str, Any]:
         """Return all that decides a stage's result."""
         known = {**self.digests, "frames": self.frames, "name": self.mesh.name}
+        known["train_overrides"] = unresolved(self.cfg.get("train_overrides"))
         return {
             key: known[key] if key in known else resolve(self.cfg.get(key))
             for key in stage.settings
         }
 
-    def job(self, folder: Path, *more: str) -> Job:
-        """Return the training, as one of a sweep: begun before, it is resumed."""
+    def job(self, folder: Path, *more: str, frames: int | None = None) -> Job:
+        """Return the training, as one of a sweep: begun before, it is resumed.
+
+        Args:
+            folder: Where its files go.
+            *more: Settings that beat all others.
+            frames: How many of the renders it has; None: all.
+        """
+        frames = frames or self.frames
         quoted = {"data.object": self.mesh.name, "data.root": self.data}
         quoted |= {"data.meshes": self.out / "meshes"}
         words = [
@@ -145,12 +154,12 @@ class Onboarding:
             "data=scenes",
             "data/augment=camera_magnified",  # as the magnified windows are
             *(f"{key}={quote(value)}" for key, value in quoted.items()),
-            f"data.generate.frames={self.frames}",
+            f"data.generate.frames={frames}",
             f"data.generate.workers={self.cfg.workers}",
             "data.generate.frames_per_scene=2",  # few scenes would be learned by heart
             "data.generate.lookalike_texture=different",
             f"data.generate.seed={self.cfg.seed}",
-            f"data.split={_split(self.frames)}",
+            f"data.split={_split(frames)}",
             f"data.limit_val={_VALIDATED}",
             f"data.limit_test={self.cfg.test_frames}",
             f"seed={self.cfg.seed}",
@@ -162,7 +171,7 @@ class Onboarding:
             words.append("warm_start=[" + ",".join(map(quote, start)) + "]")
         elif start is not None:
             words.append(f"warm_start={quote(start)}")
-        words += [*map(str, self.cfg.train_overrides), *more]
+        words += [*unresolved(self.cfg.train_overrides), *more]
         return replace(compose_job("train", find_conf(), words, folder), swept=True)
 
     @cached_property
@@ -175,22 +184,57 @@ class Onboarding:
         return build(job)
 
     @property
-    def is_measured(self) -> bool:
-        """Whether the number of steps and the time of one are known."""
-        return all(self.stages.values.get(name) is not None for name in _SPEED)
+    def speed(self) -> Speed | None:
+        """Of the training, as it was measured; None: not yet, or with other `train_overrides`."""
+        own = unresolved(self.cfg.get("train_overrides"))
+        if self.stages.values.get("measured_with", own) != own:
+            return None
+        step, image = (self.stages.values.get(name) for name in _SPEED)
+        return None if step is None or image is None else Speed(step, image)
+
+    @property
+    def spent(self) -> float:
+        """How long the stages took that have ended [s]."""
+        return sum(self.stages.seconds.values())
+
+    @property
+    def budget(self) -> float:
+        """Time for everything [s]."""
+        return float(60 * self.cfg.budget_minutes)
 
     @property
     def seconds_left(self) -> float | None:
-        """How long the rest will take, as far as it is known [s]."""
-        values, spent = self.stages.values, sum(self.stages.seconds.values())
-        if not self.is_measured:
-            known = self.cfg.steps is None
-            return max(0.0, 60 * self.cfg.budget_minutes - spent) if known else None
-        speed = Speed(values["seconds_per_step"], values["seconds_per_image"])
+        """How long the rest will take; of the budget, what is left, as long as nothing was measured
+        [s].
+        """
+        speed, steps = self.speed, self.stages.values.get("steps")
+        if speed is None:
+            return None if self.cfg.steps else max(0.0, self.budget - self.spent)
+        if steps is None:
+            steps, seconds = self.plan(speed, self.spent)
+            return float(steps * seconds) + self.to_render + self.rest(speed)
         done = 0
         with suppress(UserError):  # none yet, or a broken one
             done = step_of(self.training / "checkpoints" / LAST)
-        return float(speed.step * (values["steps"] - done)) + self.rest(speed)
+        return float(speed.step * (steps - done)) + self.rest(speed)
+
+    @property
+    def to_render(self) -> float:
+        """How long the frames take that are not rendered yet [s]."""
+        missing = max(0, self.frames - count_frames(self.data))
+        return missing * float(self.stages.values.get("seconds_per_frame") or 0.0)
+
+    def plan(self, speed: Speed, spent: float) -> tuple[int, float]:
+        """Return the number of training steps, and how long one may take [s].
+
+        Args:
+            speed: As it was measured.
+            spent: Time of all that was done [s].
+        """
+        if self.cfg.steps is not None:
+            return int(self.cfg.steps), speed.step
+        room = self.budget - spent - self.to_render - self.rest(speed)
+        return choose_steps(room, speed.step)
 
     def rest(self, speed: Speed) -> float:
         """Return how long what follows the training, and is not done, takes [s]."""
@@ -212,7 +256,7 @@ def onboard(job: Job) -> None:
     cfg = job.cfg
     settle(cfg.threads, cfg.seed)
     if cfg.train_overrides:  # a mistake in them is told before anything is written
-        overrides = [*map(str, cfg.train_overrides)]
+        overrides = unresolved(cfg.train_overrides)
         for key in ("trainer.max_steps", "trainer.val_check_interval"):
             if key in map(key_of, overrides):
                 raise UserError(
@@ -236,8 +280,11 @@ def onboard(job: Job) -> None:
             say(cfg.console, "stage", f"{head}: done before", stage=stage.name, done=True)
             continue
         left = work.seconds_left
-        tail = "" if left is None else f"; about {format_duration(left)} left"
-        say(cfg.console, "stage", head + tail, stage=stage.name, done=False, seconds_left=left)
+        if left is not None:
+            duration = format_duration(left)
+            known = work.speed is not None
+            head += f"; about {duration} left" if known else f"; {duration} of the budget left"
+        say(cfg.console, "stage", head, stage=stage.name, done=False, seconds_left=left)
         doing = partial(stage.do, work)
         work.stages.run(stage.name, work.settings_of(stage), doing, stage.costly)
     tell(work)
@@ -273,22 +320,64 @@ def use_symmetries(work: Onboarding) -> None:
 
 
 def render(work: Onboarding) -> None:
-    """Render what is missing."""
+    """Render what is missing; the training is measured as soon as there are frames enough for it,
+    so that a budget which is too short is told before most of the time is spent.
+    """
+    if work.speed is None:
+        began, before = time.perf_counter(), count_frames(work.data)
+        few = work.job(work.out / ".trial", frames=min(work.frames, _FEWEST_FRAMES))
+        build_data(few.cfg.data, work.cfg.console)
+        rendered = count_frames(work.data) - before
+        if rendered > 0:
+            work.stages.keep(seconds_per_frame=(time.perf_counter() - began) / rendered)
+        measure(work, few, began)
     build_data(work.job(work.training).cfg.data, work.cfg.console)
+
+
+def count_frames(folder: Path) -> int:
+    """Return how many frames of a dataset are rendered."""
+    return sum(1 for _ in folder.glob("mixed/*/[0-9]*.left.json"))
+
+
+def measure(work: Onboarding, job: Job, began: float) -> None:
+    """Measure the training, and say so where the budget does not hold the least of it.
+
+    Args:
+        work: What is to be done.
+        job: The training, on frames that are rendered.
+        began: When this stage did, by `time.perf_counter`.
+    """
+    say(work.cfg.console, "measuring", "measuring the time of a step and of an image")
+    speed = measure_speed(job)
+    work.stages.keep(
+        seconds_per_step=speed.step,
+        seconds_per_image=speed.image,
+        measured_with=unresolved(work.cfg.get("train_overrides")),
+    )
+    spent = work.spent + time.perf_counter() - began
+    least = spent + work.to_render + _FEWEST_STEPS * speed.step + work.rest(speed)
+    if work.cfg.steps is None and least > work.budget:
+        minutes = math.ceil(least / 6) / 10
+        warn(
+            work.cfg.console,
+            f"budget_minutes={work.cfg.budget_minutes:g} is too short on this machine and will be "
+            f"exceeded: {work.frames} frames, {_FEWEST_STEPS} training steps, calibration and test "
+            f"take about {format_duration(least)}; the least that holds them: "
+            f"budget_minutes={minutes:g} frames={work.frames}",
+            seconds=least,
+        )
 
 
 def train(work: Onboarding) -> None:
     """Train for as many steps as fit, from where it was interrupted if it was."""
     values, console = work.stages.values, work.cfg.console
-    if not work.is_measured:
+    if values.get("steps") is None:
         began = time.perf_counter()
-        speed = measure_speed(work.job(work.out / ".trial"))
-        steps, seconds = work.cfg.steps, speed.step
-        if steps is None:
-            spent = sum(work.stages.seconds.values()) + time.perf_counter() - began
-            room = 60 * work.cfg.budget_minutes - spent - work.rest(speed)
-            steps, seconds = choose_steps(room, speed.step)
-        work.stages.keep(steps=int(steps), seconds_per_step=seconds, seconds_per_image=speed.image)
+        if work.speed is None:  # rendered by an earlier version, or other settings since
+            measure(work, work.job(work.out / ".trial"), began)
+        assert work.speed is not None
+        steps, seconds = work.plan(work.speed, work.spent + time.perf_counter() - began)
+        work.stages.keep(steps=steps, seconds_per_step=seconds)
         duration = format_duration(steps * seconds)
         fixed = f"{steps} steps of {seconds:.2f} s each: {duration}"
         sentence = fixed if work.cfg.steps else f"at most {steps} steps in {duration}"
@@ -322,6 +411,9 @@ def calibrate(work: Onboarding) -> None:
     """Give the weights a probability, from validation scenes and from renders without the object;
     say so where there are too few.
     """
+    if work.stages.seconds["calibrate"]:
+        said = "the calibration was interrupted: its renders are kept, its estimates begin anew"
+        say(work.cfg.console, "begins_anew", said)
     job = work.job(work.training, f"data.limit_val={_CALIBRATED}")
     data = build_data(job.cfg.data, work.cfg.console)
     data.setup("validate")
@@ -339,8 +431,7 @@ def calibrate(work: Onboarding) -> None:
     checkpoint = read_checkpoint(work.weights)
     method = method_of(checkpoint, lightning=False)
     method.to(choose_device())
-    shown = work.cfg.console != JSON
-    calibration = learn(method, [data.val_dataset], [without], data.source, shown)
+    calibration = learn(method, [data.val_dataset], [without], data.source, work.cfg.console)
     save_whole({**checkpoint, "calibration": calibration.to_plain()}, work.weights)
     work.stages.keep(calibration={"counts": calibration.counts, "quality": calibration.quality})
 

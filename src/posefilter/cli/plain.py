@@ -67,3 +67,8 @@ def find(node: Any, path: str) -> Any:
 def resolve(node: Any) -> Any:
     """Return a part of the settings with what it refers to."""
     return OmegaConf.to_container(node, resolve=True) if OmegaConf.is_config(node) else node
+
+
+def unresolved(node: Any) -> Any:
+    """Return a part of the settings as it is written."""
+    return OmegaConf.to_container(node, resolve=False) if OmegaConf.is_config(node) else node

@@ -4,10 +4,10 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
-from omegaconf import DictConfig, ListConfig, OmegaConf
+from omegaconf import DictConfig, OmegaConf
 
 from posefilter.cli.arguments import TYPED
-from posefilter.cli.plain import find
+from posefilter.cli.plain import find, unresolved
 from posefilter.errors import UserError, missing_package
 from posefilter.weights import expand_weights, find_weights, is_several
 
@@ -83,8 +83,8 @@ def check_files(command: str, cfg: DictConfig) -> None:
         mesh = Path(str(cfg.mesh))
         if not mesh.is_file() and mesh.suffix:  # a name without an ending may be a builtin one's
             raise UserError(f"mesh={mesh}: no such file")
-        more = cfg.train_overrides
-        if not (isinstance(more, ListConfig) and all(isinstance(one, str) for one in more)):
+        more = unresolved(cfg.train_overrides)  # interpolations are the training's
+        if not (isinstance(more, list) and all(isinstance(one, str) for one in more)):
             raise UserError(
                 f"train_overrides={more}: must be a list, such as ['filter.particles=200']"
             )

@@ -59,7 +59,7 @@ def run_job(cfg: DictConfig, name: str, begun: list[Job], kept: list[Job]) -> An
     except EXPECTED as error:  # a setting refers to nothing
         raise Carrier(error) from error
     try:
-        check_settings(cfg, name)
+        check_settings(cfg, name, job.choices)
         if name in _OWN_FOLDER:
             hold_folder(job.folder)
         forget_failure(job)
