@@ -170,6 +170,19 @@ def test_a_selection_keeps_the_extremes_whatever_their_order() -> None:
     assert found == {"first": [0.3], "best": [0.1, 0.2], "worst": [0.5, 0.4]}
 
 
+@pytest.mark.parametrize("best", [0.1, math.inf])
+def test_an_image_is_among_the_best_or_among_the_worst(best: float) -> None:
+    """Of fewer images than both take, each is drawn once."""
+    kept = ImageSelection(first=9, best=2, worst=3)
+    for error in (0.3, best, 0.2):
+        image = KeptImage(0, "", error, *(np.zeros(0),) * 6)
+        kept.offer(error, lambda image=image: image)  # type: ignore[misc]
+    chosen = kept.separate()
+    found = {name: [one.error for one in images] for name, images in chosen.items()}
+    ranked = sorted((0.3, best, 0.2))
+    assert found == {"first": [0.3, best, 0.2], "best": ranked[:1], "worst": ranked[:0:-1]}
+
+
 def test_lengths_are_in_meters_where_millimeters_get_long() -> None:
     lengths = (0.00123, 0.0356, 0.9994, 1.3561, 250.0, math.inf)
     assert [format_length(x) for x in lengths] == [

@@ -2,15 +2,18 @@
 
 import math
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
+from scipy.stats import chi2
 
 from posefilter.belief import Belief
 from posefilter.figures.belief import (
     Mark,
     describe_belief,
+    describe_samples,
     draw_belief,
     draw_rotations,
     find_longest_axis,
@@ -246,13 +249,17 @@ def test_a_second_pose_is_reported_with_its_share() -> None:
     assert found.share == pytest.approx(0.7, abs=0.01)
     assert found.second is not None
     assert found.second.weight == pytest.approx(0.3, abs=0.01)
-    assert found.translation == pytest.approx(0.004 * math.sqrt(3), rel=0.15)
-    assert found.rotation == pytest.approx(0.03 * math.sqrt(3), rel=0.15)
+    quantile = math.sqrt(chi2.ppf(0.95, 3))
+    assert found.uncertainty.translation == pytest.approx(0.004 * quantile, rel=0.15)
+    assert found.uncertainty.rotation == pytest.approx(0.03 * quantile, rel=0.15)
     assert found.second_rotation == pytest.approx(
         float(angle_between(a[:3, :3], b[:3, :3])), abs=0.15
     )
     sure, other = describe_belief(found)
-    assert re.fullmatch(r"sure to ±[67]\.\d+ mm, ±[23]\.\d°", sure)
+    assert re.fullmatch(
+        r"within 1\d\.\d mm and [45]\.\d degrees \(95 %\) of a pose that has 70 % of the belief",
+        sure,
+    )
     assert re.fullmatch(r"second pose 30 %: [\d.]+ mm and \d+° off", other)
 
 
@@ -272,7 +279,7 @@ def test_an_equivalent_pose_is_no_second_one() -> None:
     found = summarize_belief(poses, weights, best, model()._replace(symmetries=group))
     assert found.second is None
     assert found.share == pytest.approx(1)
-    assert found.rotation < 0.01
+    assert found.uncertainty.rotation < 0.01
 
 
 def test_the_draws_of_a_calibrated_belief_are_one_mode_however_far_apart() -> None:
@@ -290,8 +297,32 @@ def test_the_draws_of_a_calibrated_belief_are_one_mode_however_far_apart() -> No
     assert found.second is not None
     assert found.second.weight == pytest.approx(belief.modes[1].mass)
     assert found.share == pytest.approx(0.75)
-    assert found.translation == pytest.approx(0.03 * math.sqrt(3), rel=0.1)
-    assert found.rotation == pytest.approx(0.4 * math.sqrt(3), rel=0.1)
+    assert found.uncertainty == belief.uncertainty()  # which the console names, too
+    assert describe_belief(found)[0] == belief.uncertainty().describe()
+    np.testing.assert_allclose(select_single(belief)[2], belief.modes[0].pose, atol=1e-9)
+
+
+def test_weights_are_explained_where_they_tell_something() -> None:
+    """Of draws, whose weights are equal, there is neither their scale nor an effective number."""
+    weights = torch.tensor([0.5, 0.25, 0.125, 0.125]).double()
+    what, colored, scale = describe_samples(weights, 0)
+    assert what == "4 particles, 3 effective."
+    assert colored
+    assert len(scale) == 1
+    what, colored, scale = describe_samples(torch.full((4,), 0.25).double(), 3)
+    assert what == "3 draws of the error model about the estimate, 1 of other modes."
+    assert not colored + "".join(map(str, scale))
+    assert "other" not in describe_samples(torch.full((4,), 0.25).double(), 4)[0]
+
+
+def test_the_draws_of_a_belief_are_known_to_its_picture() -> None:
+    batch, _, _ = two_modes()
+    poses, weights, _ = select_single(batch)
+    sizes = (model().center.double().numpy(), 0.136, 0.27, "box")
+    plain = Belief(poses.numpy(), weights.numpy(), *sizes)
+    drawn = replace(plain, draws=len(weights))
+    pictures = [draw_belief(RGB, K, one, model()) for one in (plain, drawn)]
+    assert pictures[0].shape[0] > pictures[1].shape[0]
 
 
 def test_a_single_pose_and_a_lost_estimate_are_reported() -> None:
@@ -305,7 +336,7 @@ def test_a_single_pose_and_a_lost_estimate_are_reported() -> None:
     away[2, 3] += 1.0
     lost = summarize_belief(poses[keep], weights[keep], away, model())
     assert lost.share == 0
-    assert describe_belief(lost)[0] == "the estimate lies apart from the particles"
+    assert describe_belief(lost)[0].startswith("the estimate lies apart from the particles, which")
 
 
 def test_nothing_is_written_under_a_mark() -> None:

@@ -41,6 +41,14 @@ def test_marks_are_where_they_point_and_on_the_rim_where_that_is_beyond() -> Non
         assert abs(rows.mean() - v) < 1.5
 
 
+def test_a_label_that_is_longer_than_its_axis_is_whole() -> None:
+    plain, y = np.full((3, 3, 3), 128, np.uint8), Y._replace(label="object's y [mm]")
+    wide, narrow = (
+        draw_heat_panel(plain, X, y, size + LEFT + RIGHT)[:, :20].min(-1) for size in (300, 104)
+    )
+    assert (narrow < 128).sum() == (wide < 128).sum() > 100
+
+
 def test_a_curve_goes_through_its_numbers_and_is_cut_at_the_ends() -> None:
     places = np.array([-10.0, 0.0, 10.0])
     lines = [(np.array([-50.0, 5.0, -5.0]), (255, 0, 0))]

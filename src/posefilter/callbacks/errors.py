@@ -60,8 +60,9 @@ class ErrorTable(TraceCallback):
             return
         write_errors(self.folder / FILE, self.rows)
         shape = find_shape(trainer, pl_module)
+        chosen = self._selection.separate()
         for name in ("worst", "best"):
-            kept = self._selection.kept[name]
+            kept = chosen[name]
             if kept:
                 title = f"The {len(kept)} {name} images\nof {len(self.rows)} of the test"
                 figure = draw_gallery(kept, shape, "pose" in pl_module.capabilities, title)

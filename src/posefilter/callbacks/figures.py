@@ -107,7 +107,7 @@ class Figures(TraceCallback):
         if self._example is None:
             return
         if trainer.is_global_zero:
-            kept, step = self._selection.kept, trainer.global_step
+            kept, step = self._selection.separate(), trainer.global_step
             assert isinstance(pl_module, PoseEstimator)
             self.budget.draw(partial(self._draw, trainer, pl_module, self._example, kept, step))
 

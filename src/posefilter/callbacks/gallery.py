@@ -84,6 +84,17 @@ class ImageSelection:
                 ranked.sort(key=lambda one: sign * one.error)
                 del ranked[counts[name] :]
 
+    def separate(self) -> dict[str, list[KeptImage]]:
+        """Return what is kept, no image both among the best and among the worst: of fewer images
+        than both take, each takes its share.
+        """
+        best, worst = self.kept["best"], self.kept["worst"]
+        every = [*best, *(one for one in worst[::-1] if all(one is not other for other in best))]
+        if len(every) == len(best) + len(worst):
+            return self.kept
+        count = len(every) * self.counts["best"] // (self.counts["best"] + self.counts["worst"])
+        return {**self.kept, "best": every[:count], "worst": every[count:][::-1]}
+
 
 def name_frame(trainer: Trainer, split: str, frame_id: int) -> str:
     """Return a frame's name in its dataset, or its number where no dataset is at hand."""

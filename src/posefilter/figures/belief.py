@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 
-from posefilter.belief import Belief
+from posefilter.belief import Belief, Uncertainty
 from posefilter.figures.canvas import Color, View, arrange_grid, draw_dots, halve
 from posefilter.figures.layout import (
     CAPTION,
@@ -43,7 +43,6 @@ from posefilter.geometry.pose import origin_of, rotation_of
 from posefilter.geometry.rotation import angle_between
 from posefilter.geometry.spaces import PoseSpace
 from posefilter.images import to_camera, to_picture, to_pose
-from posefilter.metrics.beliefs import spread
 from posefilter.types import BeliefBatch, ObjectModel
 
 _SECOND: Color = (226, 110, 0)
@@ -72,16 +71,17 @@ def draw_belief(
     marginals.
 
     rgb: one image in any form that `Estimator.predict` takes; intrinsics (3, 3) [px]; belief: a
-    result's, whose heaviest mode is then the estimate, or a filter's tensors of one image, with
-    their leading dimension of 1 or without; truth (4, 4); axis: the object's axis on the map (its
-    longest, if None); draws: so many of the tensors' first poses are a calibrated belief's draws
-    about the estimate. Raises UserError where one is not as it should be.
+    result's, whose heaviest mode, or the mean of its draws, is then the estimate, or a filter's
+    tensors of one image, with their leading dimension of 1 or without; truth (4, 4); axis: the
+    object's axis on the map (its longest, if None); draws: so many of the tensors' first poses are
+    a calibrated belief's draws about the estimate. Raises UserError where one is not as it should
+    be.
     """
     rgb, K = to_picture(rgb), to_camera(intrinsics)
     poses, weights, best = select_single(belief)
+    draws = belief.draws if isinstance(belief, Belief) else draws
     true = None if truth is None else torch.from_numpy(to_pose(truth))
     axis = find_longest_axis(object_model) if axis is None else axis
-    ess = float(1 / weights.square().sum())
     summary = summarize_belief(poses, weights, best, object_model, draws)
     sure, other = describe_belief(summary)
     marks = [Mark(best, ESTIMATE, "square"), *([] if true is None else [Mark(true, TRUTH, "ring")])]
@@ -90,11 +90,12 @@ def draw_belief(
         marks.append(Mark(torch.from_numpy(summary.second.pose).double(), _SECOND, "diamond"))
         entries.append(("second pose", _SECOND))
     half, axis_name = tile_width(2), OBJECT_AXES[axis]
+    what, colored, scale = describe_samples(weights, draws)
     words = [
-        f"{len(weights)} particles, {ess:.0f} effective.",
-        f"±: root mean square in the estimate's mode, {summary.share:.0%} of the belief.",
+        what,
+        f"The estimate's mode has {summary.share:.0%} of the belief.",
         f"Map: where the object's {axis_name} axis points; color: the rotation about that axis.",
-        "Photograph: where the particles put the object's center, colored by weight.",
+        f"Photograph: where they put the object's center{colored}.",
         "Below: shares of the belief. Translations are from its mean, rotations from the estimate.",
     ]
     notes = [draw_legend(entries, half), *(draw_text(text, DETAIL, half) for text in words)]
@@ -106,7 +107,7 @@ def draw_belief(
         draw_rotations(poses, weights, marks, axis, tile_width(1)),
         draw_turn_scale(),
         arrange_row([centers, np.concatenate(notes)]),
-        draw_weight_scale(),
+        *scale,
         *draw_marginals(poses, weights, best, true, object_model),
     )
 
@@ -116,8 +117,12 @@ def select_single(belief: Belief | BeliefBatch) -> tuple[torch.Tensor, torch.Ten
     one image.
     """
     if isinstance(belief, Belief):
-        best = torch.from_numpy(belief.modes[0].pose)
-        return torch.from_numpy(belief.samples), torch.from_numpy(belief.weights), best
+        poses, weights = torch.from_numpy(belief.samples), torch.from_numpy(belief.weights)
+        best, own = torch.from_numpy(belief.modes[0].pose), weights[: belief.draws]
+        if belief.draws:
+            space = PoseSpace((*belief.center.tolist(),), belief.radius)
+            best = space.mean(poses[: belief.draws], own / own.sum())
+        return poses, weights, best
     poses, log_weights, best = (
         x.detach().cpu().double() for x in (belief.poses, belief.log_weights, belief.best)
     )
@@ -126,6 +131,18 @@ def select_single(belief: Belief | BeliefBatch) -> tuple[torch.Tensor, torch.Ten
             raise ValueError(f"expected a belief about one image, got one about {len(poses)}")
         poses, log_weights, best = poses[0], log_weights[0], best[0]
     return poses, torch.softmax(log_weights, 0), best
+
+
+def describe_samples(weights: torch.Tensor, draws: int) -> tuple[str, str, list[np.ndarray]]:
+    """Return what the samples of a belief are, what is added where they are colored by weight, and
+    the scale of that, if there is one: draws have equal weights, which tell nothing.
+    """
+    if not draws:
+        ess = float(1 / weights.square().sum())
+        what = f"{len(weights)} particles, {ess:.0f} effective."
+        return what, ", colored by weight", [draw_weight_scale()]
+    others = f", {len(weights) - draws} of other modes" if draws < len(weights) else ""
+    return f"{draws} draws of the error model about the estimate{others}.", "", []
 
 
 def find_longest_axis(object_model: ObjectModel) -> int:
@@ -221,8 +238,7 @@ def choose_window(
 class BeliefSummary(NamedTuple):
     """How sure a belief about one image is."""
 
-    translation: float  # root mean square distance of the estimate's mode's centers from their mean
-    rotation: float  # the same of the rotations [rad]
+    uncertainty: Uncertainty  # at 95 %
     share: float  # weight of the estimate's mode, 0 where the estimate belongs to none
     second: Hypothesis | None  # the heaviest of the other modes, if one counts
     second_translation: float  # how far its center is from the estimate's [m]
@@ -247,28 +263,30 @@ def summarize_belief(
     """
     center = object_model.center.detach().cpu().double()
     found = find_hypotheses(poses, weights.log(), best, object_model, draws)
-    space = PoseSpace((*center.tolist(),), object_model.radius)
-    members = found.own if bool(found.own.any()) else torch.ones_like(found.own)
-    own = torch.where(members, weights, 0.0)
-    translation, rotation = spread(found.poses[None], (own / own.sum()).log()[None], space)
+    whole = Belief(
+        poses.numpy(),
+        weights.numpy(),
+        center.numpy(),
+        object_model.radius,
+        object_model.diameter,
+        object_model.name,
+        object_model.symmetries.detach().cpu().double().numpy(),
+        draws,
+    )
     second = found.others[0] if found.others else None
     away = turned = 0.0
     if second is not None:
         other = torch.from_numpy(second.pose).to(best)
         away = float((origin_of(other, center) - origin_of(best, center)).norm())
         turned = float(angle_between(rotation_of(other), rotation_of(best)))
-    return BeliefSummary(
-        float(translation), float(rotation), found.estimate.weight, second, away, turned
-    )
+    return BeliefSummary(whole.uncertainty(), found.estimate.weight, second, away, turned)
 
 
 def describe_belief(summary: BeliefSummary) -> tuple[str, str]:
     """Return how sure a belief is, and what it says of a second pose: two sentences."""
-    rotation = math.degrees(summary.rotation)
-    angle = f"{rotation:.2g}" if rotation < 10 else f"{rotation:.0f}"
-    sure = f"sure to ±{format_length(summary.translation)}, ±{angle}°"
+    sure = summary.uncertainty.describe()
     if summary.share == 0:
-        sure = "the estimate lies apart from the particles"
+        sure = f"the estimate lies apart from the particles, which are {sure}"
     if summary.second is None:
         return sure, "no second pose above 1 %"
     away, turned = format_length(summary.second_translation), math.degrees(summary.second_rotation)

@@ -147,9 +147,10 @@ def add_frame(plot: np.ndarray, x: Axis, y: Axis) -> np.ndarray:
         pen.text((LEFT - 7, v), f"{value:g}", fill=INK, font=letters, anchor="rm")
     pen.text((LEFT + width / 2, TOP + height + 25), x.label, fill=INK, font=letters, anchor="mt")
     if y.label:
-        side = Image.new("RGB", (height, 20), PAPER)
-        ImageDraw.Draw(side).text((height / 2, 10), y.label, fill=INK, font=letters, anchor="mm")
-        image.paste(side.rotate(90, expand=True), (0, TOP))
+        side = Image.new("RGB", (figure.shape[0], 20), PAPER)  # a label may be longer than its axis
+        at = min(BOTTOM + height / 2, figure.shape[0] - letters.getlength(y.label) / 2)
+        ImageDraw.Draw(side).text((at, 10), y.label, fill=INK, font=letters, anchor="mm")
+        image.paste(side.rotate(90, expand=True), (0, 0))
     return np.asarray(image)
 
 
