@@ -166,7 +166,12 @@ _CHOICES = {
     "console": {"plain": "json"},
     "callbacks": {"none": "checkpoints"},
     "debug": {"trace": "traceback"},
-    "sweep": {"ladder": "ablation", "ladder_detect": "ablation_detect", "iterations": "steps"},
+    "sweep": {
+        "ablation_pose": "ablation_pose_pf",
+        "ladder": "ablation",
+        "ladder_detect": "ablation_detect",
+        "iterations": "steps",
+    },
     "ablation": {
         "s4_lesson": "s4_displacement_loss",
         "s5_place": "s5_position",
