@@ -40,8 +40,8 @@ MEMORISED = "memorize/experiment=memorize,model={},seed=0,variant=working"
 HELD_OUT = "held_out/model={},seed=0"
 OTHER_RUN = "objects/{}/*model={},*"  # its name is cut
 OTHER_OBJECTS = ("009_gelatin_box", "006_mustard_bottle", "004_sugar_box", "002_master_chef_can")
-POSE_ROWS = "model=pose_pf sweep=ablation_pose"
-POSE_RUN = "ablation_pose/ablation={},model=pose_pf,seed=0,sweep=ablation_pose"
+POSE_ROWS = "model=pose_pf sweep=ablation_pose_pf"
+POSE_RUN = "ablation_pose_pf/ablation={},model=pose_pf,seed=0,sweep=ablation_pose_pf"
 # the paper's variant small enough for many rows; detectors at the unit at which they gain, since
 # where nothing works no choice can tell
 SMALL = "model={} experiment=memorize sweep=ablation ablation=paper callbacks=checkpoints"
@@ -294,7 +294,7 @@ def list_pose_rows(seeds: str) -> list[Line]:
     series = [[n for n in names if n.startswith(f"pose_pf_{kind}")] for kind in "mcs"]
     first = ["working", "paper", *series[0]]
     return [
-        Line("ablation_pose", f"{POSE_ROWS} ablation={','.join(some)} {seeds}")
+        Line("ablation_pose_pf", f"{POSE_ROWS} ablation={','.join(some)} {seeds}")
         for some in (first, *series[1:])
     ]
 
@@ -335,7 +335,7 @@ def list_paper() -> list[Line]:
 def list_choices() -> list[Line]:
     """Return the runs over what the paper leaves open, the cheapest size at which one can tell:
     rows of docs/methods/choices.md. What they are held against is in `unit`, `paper_add` and
-    `ablation_pose`.
+    `ablation_pose_pf`.
     """
     unit, seeds = "model.displacement.unit=1", "seed=0,1,2"
     detector, patch = f"{SMALL_BOX} {unit}", SMALL.format("patch_pf")

@@ -42,7 +42,7 @@ PRESETS = [
     (model, variant) for model in MODELS for variant in list_choices(CONF / "preset" / model)
 ]
 EXPERIMENTS = list_choices(CONF / "experiment")
-ABLATIONS = ("ablation", "ablation_detect", "ablation_pose")
+ABLATIONS = ("ablation", "ablation_detect", "ablation_pose_pf")
 SWEEPS = [
     *list_choices(CONF / "sweep"),
     *(pytest.param(name, marks=pytest.mark.slow) for name in ABLATIONS),
@@ -200,7 +200,7 @@ def test_every_experiment_builds(experiment: str, model: str, tmp_path: Path) ->
 
 @pytest.mark.parametrize("sweep", SWEEPS)
 def test_every_point_of_every_sweep_composes(sweep: str) -> None:
-    kinds = {"ablation_detect": "cnn_patch", "ablation_pose": "pose_pf"}
+    kinds = {"ablation_detect": "cnn_patch", "ablation_pose_pf": "pose_pf"}
     model = kinds.get(sweep, "patch_pf")
     with initialize_config_dir(str(CONF.resolve()), version_base="1.3"):
         swept = hydra_compose(

@@ -243,7 +243,7 @@ def test_each_ablation_changes_what_it_says(ablation: Ablation) -> None:
 
 @pytest.mark.parametrize("name", list_pose_space_ablations())
 def test_each_ablation_of_the_pose_filter_fits_together(name: str) -> None:
-    job = compose_once("model=pose_pf", "sweep=ablation_pose", f"ablation={name}")
+    job = compose_once("model=pose_pf", "sweep=ablation_pose_pf", f"ablation={name}")
     method = build_method(recipe(job))
     assert (method.filter.particles, method.filter.steps, method.pixels) == (100, 10, 32)
 

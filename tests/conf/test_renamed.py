@@ -62,6 +62,7 @@ RENAMED = {
     "ablation=s5_place": "ablation=s5_position",
     "deviation=patch_pf/paper": "preset=patch_pf/paper",
     "sweep=ladder": "sweep=ablation",
+    "sweep=ablation_pose": "sweep=ablation_pose_pf",
     "experiment=memorise": "experiment=memorize",
     "console=plain": "console=json",
     "callbacks=none": "callbacks=checkpoints",

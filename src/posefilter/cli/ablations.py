@@ -313,12 +313,12 @@ def _sweep(names: list[str], groups: dict[str, str], **settings: Any) -> dict[st
 def register_ablations() -> None:
     """Register the table with Hydra: rows are chosen like files of `conf/ablation/`,
     `ablation=NAME`, or all for a kind of method in one sweep, by `sweep=ablation`,
-    `sweep=ablation_detect` and `sweep=ablation_pose`.
+    `sweep=ablation_detect` and `sweep=ablation_pose_pf`.
 
     All runs of `sweep=ablation` have the size of the working preset, so that a row differs from the
     next in its modification alone. All runs of `sweep=ablation_detect` have 32 particles, for time;
     those that start from the paper keep its 30 steps, since shorter roll-outs are a modification.
-    All runs of `sweep=ablation_pose`, for pose_pf, are of `experiment=small_scenes`.
+    All runs of `sweep=ablation_pose_pf`, for pose_pf, are of `experiment=small_scenes`.
     """
     store = ConfigStore.instance()
     for ablation in ABLATIONS:
@@ -327,7 +327,7 @@ def register_ablations() -> None:
     sweeps = {
         "ablation": _sweep(list_pose_ablations(), {SIZE: "${model}"}),
         "ablation_detect": _sweep(list_detector_ablations(), {}, filter={"particles": 32}),
-        "ablation_pose": _sweep(list_pose_space_ablations(), {"experiment": "small_scenes"}),
+        "ablation_pose_pf": _sweep(list_pose_space_ablations(), {"experiment": "small_scenes"}),
     }
     for name, node in sweeps.items():
         store.store(group="sweep", name=name, node=node, package="_global_")

@@ -137,7 +137,8 @@ experiment: memorise > memorize
 console: plain > json
 callbacks: none > checkpoints
 debug: trace > traceback
-sweep: ladder > ablation, ladder_detect > ablation_detect, iterations > steps
+sweep: ablation_pose > ablation_pose_pf, ladder > ablation, ladder_detect > ablation_detect,
+    iterations > steps
 ablation: s4_lesson > s4_displacement_loss, s5_place > s5_position,
     s9_lesson_and_place > s9_displacement_loss_and_position, c1_normalisation > c1_normalization,
     c5_lesson > c5_displacement_loss, c6_place > c6_position, c8_truncated > c8_short,
