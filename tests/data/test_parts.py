@@ -233,10 +233,10 @@ def test_poses_that_are_no_numbers_score_nothing(meshes: MeshStore) -> None:
 
 def test_a_checkpoint_keeps_the_parts_and_foreign_ones_are_checked(meshes: MeshStore) -> None:
     model = object_model(meshes.load("obj_000002"))._asdict()
-    _check_object(model, "here")
+    _check_object(model)
     for parts in ({"../x": model["hull"]}, {"foot": torch.zeros(3)}, {"foot": "x"}, [1]):
-        with pytest.raises(UserError, match=r"^here: its object's "):
-            _check_object({**model, "parts": parts}, "here")
+        with pytest.raises(UserError, match=r"^its object's "):
+            _check_object({**model, "parts": parts})
 
 
 def test_a_cut_part_keeps_color_and_normals(meshes: MeshStore) -> None:
