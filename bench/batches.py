@@ -5,7 +5,8 @@
 An estimate without anything before it, image by image and 8 in one call; both in turn, in one
 process. Then what an estimate multiplies and adds in matrix products and convolutions, counted by
 torch, against the fastest product, in the type that estimates take, that this machine was seen to
-do in the same process: how much a batch could win at most. Writes the table of docs/performance.md.
+do in the same process: how much a batch could win at most. Writes the table of docs/performance.md,
+but for other weights or settings than those that ship, which are only printed.
 """
 
 import math
@@ -119,6 +120,8 @@ def main() -> None:
     parser.add_argument("--frames", required=True, help="a folder of YCB-Video")
     parser.add_argument("--meshes", required=True, help="a folder of YCB's meshes")
     parser.add_argument("--only", default="003_cracker_box", help="the object")
+    parser.add_argument("--weights", help="a file of the object, in place of what ships")
+    parser.add_argument("--overrides", nargs="*", default=[], help="such as filter.steps=4")
     parser.add_argument("--threads", type=int, nargs="+", default=[1, 2])
     parser.add_argument("--size", type=int, default=8, help="images in a batch")
     parser.add_argument("--rounds", type=int, default=4, help="batches")
@@ -129,7 +132,8 @@ def main() -> None:
     reader = open_reader("ycb_video", options.frames, names, meshes, subsets=["data"])
     frames = [frame for scene in list_scenes(reader) for frame in SceneVideo(reader, scene, names)]
     frames = [frame for frame in frames if options.only in frame.truth][: options.size]
-    estimator = posefilter.load(options.only, device="cpu")
+    weights = options.weights or options.only
+    estimator = posefilter.load(weights, device="cpu", overrides=options.overrides)
     first = frames[0]
     torch.set_num_threads(max(options.threads))
     wall, cpu = take_time(lambda: estimator.predict(first.rgb, first.depth, first.intrinsics))
@@ -137,7 +141,8 @@ def main() -> None:
     rows = []
     for threads in options.threads:
         rows += measure(estimator, frames, threads, options.rounds)
-    PAGE.write_text(put_table(PAGE.read_text(), "batches", HEAD, rows))
+    if not options.weights and not options.overrides:
+        PAGE.write_text(put_table(PAGE.read_text(), "batches", HEAD, rows))
 
 
 if __name__ == "__main__":
