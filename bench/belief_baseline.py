@@ -37,6 +37,7 @@ from checkpoint_frames import open_frames
 from confidence import degrees_of
 from marked import format_table
 from programs import make_parser
+from scene_bootstrap import bootstrap_scenes
 from scipy.special import gammaln
 from scipy.stats import f as f_distribution
 
@@ -178,23 +179,20 @@ def compare(found: Errors, degrees: int, folds: int = 5, seed: int = 0) -> dict[
     return out
 
 
-def bootstrap(values: np.ndarray, scene: np.ndarray, seed: int = 0) -> tuple[float, float, float]:
+def bootstrap(values: np.ndarray, scene: np.ndarray) -> tuple[float, float, float]:
     """Return the mean of values (n,), and the ends of its interval of 95 %, of a bootstrap over
     scenes (n,).
     """
-    _, number = np.unique(scene, return_inverse=True)
-    total, count = np.bincount(number, values), np.bincount(number)
-    drawn = np.random.default_rng(seed).integers(0, len(count), (_RESAMPLES, len(count)))
-    low, high = np.percentile(total[drawn].sum(1) / count[drawn].sum(1), (2.5, 97.5))
-    return float(values.mean()), float(low), float(high)
+    ends = bootstrap_scenes(scene.tolist(), lambda rows: float(values[rows].mean()), _RESAMPLES)
+    return float(values.mean()), *ends
 
 
-def tabulate(name: str, found: Errors, said: dict[str, Judgement]) -> list[list[str]]:
+def tabulate(name: str, found: Errors, judged: dict[str, Judgement]) -> list[list[str]]:
     """Return a row a model, of the frames whose estimate is right and of all."""
     rows, own = [], found.right
-    for model, one in said.items():
+    for model, one in judged.items():
         levels = [one.level[own] < level / 100 for level in SHOWN]
-        gain = one.log_density - said[SHIPPED].log_density
+        gain = one.log_density - judged[SHIPPED].log_density
         cells = [name, f"{own.sum()} of {len(own)}", model, share(np.transpose(levels))]
         for some in (own, own & (found.visibility < 0.75), np.ones_like(own)):
             if model == SHIPPED or not some.any():
@@ -245,8 +243,8 @@ def main() -> int:
         if options.root is not None:
             whole &= collect(file, method, checkpoint, options)
         found = measure_errors(method, options.store)
-        said = compare(found, degrees_of(method), options.folds)
-        rows += tabulate(method.object_model.name, found, said)
+        judged = compare(found, degrees_of(method), options.folds)
+        rows += tabulate(method.object_model.name, found, judged)
     levels = " / ".join(map(str, SHOWN))
     head = ("object", "right", "error model", f"ellipsoids of {levels} %", "gain [nat]")
     print(format_table((*head, "visibility below 0.75", "wrong ones too"), rows))

@@ -21,7 +21,7 @@ from typing import Any
 
 import torch
 from batches import stack
-from held_out import bootstrap, read_frames
+from held_out import bound_auc, read_frames
 from marked import format_row, put_table
 from programs import HOME, make_parser
 
@@ -154,7 +154,7 @@ def compare_estimates(name: str, frames: Sequence[tuple[str, Sample]]) -> Rows:
     cells = [name, str(len(frames))]
     for one in (errors, symmetric):
         for device in ("cpu", "cuda"):
-            low, high = bootstrap(scenes, one[device])
+            low, high = bound_auc(scenes, one[device])
             cells.append(f"{auc(one[device]):.1f} [{low:.1f}, {high:.1f}]")
     # a lost estimate is lost by meters, or by centimeters: beyond one they count the same
     less = (errors["cuda"].clamp_max(0.1) - errors["cpu"].clamp_max(0.1)) * 1000

@@ -26,6 +26,7 @@ import numpy as np
 import torch
 from marked import format_row
 from programs import HOME, make_parser
+from scene_bootstrap import bootstrap_scenes
 
 import posefilter
 from posefilter.data.frames import FrameRecord, NotShown, Sample
@@ -75,16 +76,9 @@ def read_frames(
     return out
 
 
-def bootstrap(scenes: Sequence[str], errors: torch.Tensor, draws: int = 1000) -> list[float]:
+def bound_auc(scenes: Sequence[str], errors: torch.Tensor) -> list[float]:
     """Return the 95 % interval of the AUC when scenes are drawn anew.  (N,) names, (N,) [m]."""
-    names = sorted(set(scenes))
-    rows = [[i for i, scene in enumerate(scenes) if scene == name] for name in names]
-    rng = np.random.default_rng(0)
-    found = []
-    for _ in range(draws):
-        chosen = rng.integers(len(names), size=len(names))
-        found.append(auc(errors[[i for one in chosen for i in rows[one]]]))
-    return [float(x) for x in np.percentile(found, [2.5, 97.5])]
+    return [*bootstrap_scenes(scenes, lambda rows: auc(errors[rows]))]
 
 
 def kind_of(mask: np.ndarray[Any, Any]) -> str:
@@ -141,9 +135,9 @@ def test(
         "images": len(frames),
         "scenes": len(set(scenes)),
         "add_auc": auc(plain),
-        "add_interval": bootstrap(scenes, plain),
+        "add_interval": bound_auc(scenes, plain),
         "add_s_auc": auc(symmetric),
-        "add_s_interval": bootstrap(scenes, symmetric),
+        "add_s_interval": bound_auc(scenes, symmetric),
         "add_recall": recall[0],
         "add_s_recall": recall[1],
         "median_mm": 1000 * float(plain.median()),

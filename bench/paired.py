@@ -11,10 +11,10 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-import numpy as np
 import torch
 from marked import format_table
 from programs import make_parser
+from scene_bootstrap import bootstrap_scenes
 
 from posefilter.metrics.image_errors import FILE, ImageError, read_errors
 from posefilter.metrics.scores import auc
@@ -63,17 +63,9 @@ def bound_difference(
         errors: (2, N) [m].
         draws: Of the bootstrap.
     """
-    names = sorted(set(scenes))
-    if len(names) < 2:
+    if len(set(scenes)) < 2:
         return None
-    rows = [[i for i, scene in enumerate(scenes) if scene == name] for name in names]
-    rng = np.random.default_rng(0)
-    found = []
-    for _ in range(draws):
-        chosen = [i for one in rng.integers(len(names), size=len(names)) for i in rows[one]]
-        found.append(auc(errors[1, chosen]) - auc(errors[0, chosen]))
-    low, high = np.percentile(found, [2.5, 97.5])
-    return float(low), float(high)
+    return bootstrap_scenes(scenes, lambda rows: auc(errors[1, rows]) - auc(errors[0, rows]), draws)
 
 
 def make_cells(name: str, scenes: Sequence[str], errors: torch.Tensor, recall: float) -> list[str]:

@@ -186,7 +186,7 @@ def test_a_calibration_tells_how_far_it_is_where_no_bar_is_seen(
 ) -> None:
     now = [0.0]
     monkeypatch.setattr("time.perf_counter", lambda: now[0])
-    for _ in calibration._told(range(10), 10, console):
+    for _ in calibration._report_progress(range(10), 10, console):
         now[0] += 20.0
     said = capsys.readouterr().out.splitlines()
     assert len(said) == 4  # every 40 s of 180

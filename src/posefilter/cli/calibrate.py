@@ -160,7 +160,7 @@ def collect_frames(
     count = sum(len(loader) for loader, _ in loaders)
     # batch after batch: all of a thousand frames would take gigabytes
     batches = ((batch, is_there) for loader, is_there in loaders for batch in loader)
-    for number, (batch, is_there) in enumerate(_told(batches, count, console)):
+    for number, (batch, is_there) in enumerate(_report_progress(batches, count, console)):
         truth = batch.camera_from_object
         seen = Batch(*(x.to(method.device) for x in hide_annotation(batch)))
         with torch.no_grad():
@@ -187,7 +187,7 @@ def collect_frames(
     return make_frames(values, there, errors), Beliefs(BeliefBatch(*own), truths), answers
 
 
-def _told(items: Iterable[_Item], count: int, console: str) -> Iterator[_Item]:
+def _report_progress(items: Iterable[_Item], count: int, console: str) -> Iterator[_Item]:
     """Yield batches, `count` of them: on a terminal under a bar, else with a line now and then."""
     began = last = time.perf_counter()
     has_bar = console != JSON and sys.stdout.isatty()
@@ -195,8 +195,8 @@ def _told(items: Iterable[_Item], count: int, console: str) -> Iterator[_Item]:
         now = time.perf_counter()
         if done and now - last >= _PAUSE and not has_bar:
             last, left = now, format_duration((now - began) / done * (count - done))
-            said = f"estimating: batch {done} of {count}, {left} left of this pass"
-            say(console, "estimating", said, batch=done, batches=count)
+            sentence = f"estimating: batch {done} of {count}, {left} left of this pass"
+            say(console, "estimating", sentence, batch=done, batches=count)
         yield item
 
 

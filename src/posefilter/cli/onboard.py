@@ -35,6 +35,7 @@ from posefilter.cli.reuse import step_of
 from posefilter.cli.stages import Stages
 from posefilter.cli.train import build, finish, fit, test
 from posefilter.confidence.fit import FEWEST
+from posefilter.data.generated_scenes import count_frames
 from posefilter.devices import choose_device
 from posefilter.errors import UserError
 from posefilter.forms import NUMBER, TEXT
@@ -334,11 +335,6 @@ def render(work: Onboarding) -> None:
     build_data(work.job(work.training).cfg.data, work.cfg.console)
 
 
-def count_frames(folder: Path) -> int:
-    """Return how many frames of a dataset are rendered."""
-    return sum(1 for _ in folder.glob("mixed/*/[0-9]*.left.json"))
-
-
 def measure(work: Onboarding, job: Job, began: float) -> None:
     """Measure the training, and say so where the budget does not hold the least of it.
 
@@ -412,8 +408,8 @@ def calibrate(work: Onboarding) -> None:
     say so where there are too few.
     """
     if work.stages.seconds["calibrate"]:
-        said = "the calibration was interrupted: its renders are kept, its estimates begin anew"
-        say(work.cfg.console, "begins_anew", said)
+        sentence = "the calibration was interrupted: its renders are kept, its estimates begin anew"
+        say(work.cfg.console, "begins_anew", sentence)
     job = work.job(work.training, f"data.limit_val={_CALIBRATED}")
     data = build_data(job.cfg.data, work.cfg.console)
     data.setup("validate")

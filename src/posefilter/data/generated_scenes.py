@@ -33,11 +33,16 @@ def ensure_scenes(root: Path, generate: Callable[[Path], Any] | None) -> None:
     )
 
 
+def count_frames(root: Path) -> int:
+    """Return how many frames a folder holds."""
+    return sum(1 for _ in root.rglob("*.left.json"))
+
+
 def _count(root: Path) -> tuple[int, int]:
     """Return how many frames a folder holds, and how many its generator was to make, if any did."""
     if not root.is_dir():
         return 0, 0
-    frames = sum(1 for _ in root.rglob("*.left.json"))
+    frames = count_frames(root)
     if frames == 0 or not (root / _MARK).is_file():
         return frames, frames
     try:
