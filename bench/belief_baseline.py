@@ -11,10 +11,10 @@ be given instead; started again, it goes on, and --minutes ends it early.
 
 All models are Student's t about the estimate:
 
-    as it ships                 of the checkpoint's calibration: s^2 C, both of the image
+    as it ships                 of the checkpoint's calibration: s^2 (C + F), s and C of the image
     one covariance              the same for every image
     C of the image, one scale   C of the particles, the same s for every image
-    one shape, shipped size     one covariance, scaled to the volume of the image's s^2 C
+    one shape, shipped size     one covariance, scaled to the volume of what ships
 
 The last three are fitted, by maximum likelihood, to the right estimates of other scenes: scenes are
 divided into --folds parts, and each is judged by what the others say.  Their degrees of freedom are
@@ -61,7 +61,7 @@ class Errors(NamedTuple):
 
     twist: np.ndarray  # (n, 6) from the estimate to the truth
     scatter: np.ndarray  # (n, 6, 6) second moment of the particles about the estimate: C
-    factor: np.ndarray  # (n,) s, of the checkpoint's calibration
+    shipped: np.ndarray  # (n, 6, 6) s^2 (C + F), of the checkpoint's calibration
     right: np.ndarray  # (n,) bool
     visibility: np.ndarray  # (n,)
     scene: np.ndarray  # (n,) names
@@ -86,8 +86,9 @@ def measure_errors(method: PoseEstimator, store: Path) -> Errors:
         probability = calibration.assess(found.features).probability
         features = calibration.standardize(found.features)
         factor = calibration.belief_scale.find_factor(probability, features)
+        shipped = factor[:, None, None] ** 2 * calibration.belief_scale.find_shape(spread.scatter)
         right = RIGHT.accepts(measure_pose_errors(found.belief.best, found.truth, object_model))
-        parts.append((*spread, factor, right, found.visibility, np.array(found.scenes)))
+        parts.append((*spread, shipped, right, found.visibility, np.array(found.scenes)))
     if not parts:
         raise SystemExit(f"{store}: holds no frames of {object_model.name}")
     columns = zip(*parts, strict=True)
@@ -149,15 +150,14 @@ def compare(found: Errors, degrees: int, folds: int = 5, seed: int = 0) -> dict[
         folds: Parts of the scenes.
         seed: Of their shuffle.
     """
-    shipped = found.factor[:, None, None] ** 2 * found.scatter
-    size = measure_size(shipped)[:, None, None] ** 2 * np.eye(6)
+    size = measure_size(found.shipped)[:, None, None] ** 2 * np.eye(6)
     even = np.broadcast_to(np.eye(6), found.scatter.shape)
     models: dict[str, tuple[Fit, np.ndarray]] = {
         "one covariance": (fit_covariance, even),
         "C of the image, one scale": (fit_scale, found.scatter),
         "one shape, shipped size": (fit_covariance, size),
     }
-    out = {SHIPPED: judge(found.twist, shipped, degrees)}
+    out = {SHIPPED: judge(found.twist, found.shipped, degrees)}
     order = np.random.default_rng(seed).permutation(np.unique(found.scene))
     fold = {scene: k % folds for k, scene in enumerate(order)}
     part = np.array([fold[scene] for scene in found.scene])

@@ -52,6 +52,13 @@ def bare(probability: Tensor) -> Tensor:
     return torch.zeros(len(probability), 0)
 
 
+def draw_true(count: int, generator: torch.Generator, degrees: int = 5) -> Tensor:
+    """Return independent draws (count, 6) of Student's t, whose moments are what they are."""
+    normal = torch.randn(count, 6, generator=generator, dtype=torch.float64)
+    squares = torch.randn(count, degrees, generator=generator, dtype=torch.float64).square()
+    return normal * (degrees / squares.sum(1, keepdim=True)).sqrt()
+
+
 def simulate(count: int, too_wide: float, slope: float, seed: int = 0) -> tuple[Beliefs, Tensor]:
     """Return beliefs whose particles are too wide by a factor, and what is said of them: errors
     shrink with the logit of the probability by `slope`.
@@ -60,8 +67,7 @@ def simulate(count: int, too_wide: float, slope: float, seed: int = 0) -> tuple[
     logit = torch.rand(count, generator=generator, dtype=torch.float64) * 6 - 1
     rotation = random_rotation(count, generator=generator).double()
     best = make_pose(rotation, torch.tensor([0.1, 0.0, 0.8], dtype=torch.float64).expand(count, 3))
-    error = torch.stack([draw_student_t(32, seed=1000 * seed + k)[0] for k in range(count)])
-    error = error * (slope * logit).exp()[:, None] @ ROOT.mT
+    error = draw_true(count, generator) * (slope * logit).exp()[:, None] @ ROOT.mT
     noise = torch.randn((count, 200, 6), generator=generator, dtype=torch.float64)
     poses = move(best[:, None], too_wide * noise @ ROOT.mT)
     beliefs = BeliefBatch(
@@ -77,9 +83,44 @@ def test_the_scale_of_simulated_errors_is_found(too_wide: float) -> None:
         measure_spread(beliefs, truth, model()), probability, bare(probability)
     )
     assert found is not None
-    # of 200 particles and the prior of 4 there is a little bias
-    assert found.bias == pytest.approx(-math.log(too_wide), abs=0.25)
     assert found.slope == pytest.approx(-0.15, abs=0.05)
+    scatter = measure_spread(beliefs, truth, model()).scatter
+    middle = torch.tensor([2.0]).sigmoid()  # of the simulated frames
+    size = found.find_factor(middle, bare(middle)) * sizes(found.find_shape(scatter)).mean()
+    true = math.exp(-0.15 * 2) * sizes(ROOT @ ROOT.mT)
+    assert float(size / true) == pytest.approx(1, abs=0.1)
+
+
+@pytest.mark.parametrize("spread_out", [0.2, 5.0])
+def test_where_particles_are_close_errors_have_the_shape_of_all(spread_out: float) -> None:
+    """And where they are far apart, that of the particles."""
+    generator = torch.Generator().manual_seed(1)
+    count = 600
+    common = 1e-3 * torch.randn(6, 6, generator=generator, dtype=torch.float64)
+    common = common @ common.mT + 1e-7 * torch.eye(6, dtype=torch.float64)
+    # of each image along an axis of its own
+    axis = torch.randn(count, 6, generator=generator, dtype=torch.float64)
+    axis = 3e-3 * spread_out * axis / axis.norm(dim=1, keepdim=True)
+    scatter = axis[:, :, None] * axis[:, None] + 1e-7 * torch.eye(6, dtype=torch.float64)
+    shape = 0.49 * (scatter + common)
+    errors = draw_true(count, generator)[..., None]
+    twist = (torch.linalg.cholesky(shape) @ errors)[..., 0]
+    probability = torch.full((count,), 0.5)
+    found = fit_belief_scale(PoseSpread(twist, scatter), probability, bare(probability))
+    assert found is not None
+    factor = found.find_factor(probability, bare(probability))[:, None, None]
+    learned = factor**2 * found.find_shape(scatter)
+    # the divergence of Kullback and Leibler between normal distributions of these covariances
+    between = torch.linalg.solve(learned, shape)
+    trace = between.diagonal(dim1=1, dim2=2).sum(1)
+    assert float(0.5 * (trace - 6 - torch.linalg.slogdet(between)[1]).mean()) < 0.1
+    without = replace(found, common=())
+    assert torch.equal(without.find_shape(scatter), scatter)
+
+
+def sizes(covariance: Tensor) -> Tensor:
+    """Return the geometric mean of the axes of ellipsoids.  (*, 6, 6) -> (*,)."""
+    return torch.linalg.slogdet(covariance)[1].div(12).exp()
 
 
 @pytest.mark.parametrize("too_wide", [0.3, 4.0])
@@ -169,10 +210,7 @@ def test_draws_have_the_moments_of_the_distribution_and_are_always_the_same(
 @pytest.mark.parametrize("degrees", [3, 5, 8])
 def test_the_degrees_of_freedom_are_found(degrees: int) -> None:
     """Also that few frames leave the usual ones."""
-    generator = torch.Generator().manual_seed(degrees)
-    normal = torch.randn(2000, 6, generator=generator, dtype=torch.float64)
-    squares = torch.randn(2000, degrees, generator=generator, dtype=torch.float64).square()
-    twist = 0.5 * normal * (degrees / squares.sum(1, keepdim=True)).sqrt()
+    twist = 0.5 * draw_true(2000, torch.Generator().manual_seed(degrees), degrees)
     scatter = torch.eye(6, dtype=torch.float64).expand(2000, 6, 6)
     probability = torch.full((2000,), 0.9)
     for count, want in ((2000, degrees), (15, 5)):
@@ -182,14 +220,17 @@ def test_the_degrees_of_freedom_are_found(degrees: int) -> None:
         assert found.degrees == want
     factor = fit_belief_scale(PoseSpread(twist, scatter), probability, bare(probability))
     assert factor is not None
-    assert float(factor.find_factor(probability[:1], bare(probability[:1]))) == pytest.approx(
-        0.5, rel=0.05
+    size = factor.find_factor(probability[:1], bare(probability[:1])) * sizes(
+        factor.find_shape(scatter[0])
     )
+    assert float(size) == pytest.approx(0.5, rel=0.05)
 
 
 def test_the_covariance_about_the_estimate_is_that_of_the_model() -> None:
     (beliefs, truth), probability = simulate(3, 2.0, slope=0)
-    scale = BeliefScale(bias=-0.5, slope=-0.1)
+    lower = torch.linalg.cholesky(ROOT @ ROOT.mT)
+    common = tuple(lower[torch.tril_indices(6, 6).unbind()].tolist())
+    scale = BeliefScale(bias=-0.5, slope=-0.1, common=common)
     out, _ = calibrate_belief(beliefs, probability, bare(probability), scale, model())
     assert torch.equal(out.best, beliefs.best)
     assert torch.equal(out.score, beliefs.score)
@@ -200,7 +241,7 @@ def test_the_covariance_about_the_estimate_is_that_of_the_model() -> None:
         own = Belief(out.poses[i].numpy(), weights.numpy(), CENTER.numpy(), RADIUS, DIAMETER)
         unit = np.array([1.0] * 3 + [RADIUS] * 3)
         found = own.covariance_about(beliefs.best[i].numpy()) * unit[:, None] * unit
-        wanted = (5 / 3 * factor[i] ** 2 * scatter[i]).numpy()
+        wanted = (5 / 3 * factor[i] ** 2 * (scatter[i] + ROOT @ ROOT.mT)).numpy()
         assert found == pytest.approx(wanted, abs=1e-3 * float(wanted.max()))
 
 
@@ -305,9 +346,18 @@ def test_ten_frames_do_not_take_a_fit_far_from_what_is_known_of_other_objects() 
     )
     found = fit_belief_scale(spread, torch.full((10,), 0.5), torch.zeros(10, 2))
     assert found is not None
-    # minus log posterior: 60 bias + ((bias + 0.2) / 0.5)^2 / 2, and of the slope its prior alone
-    assert found.bias == pytest.approx(-0.2 - 60 * 0.5**2, abs=1e-3)
+    # no errors at all: as small as a scale may be, and of the slope its prior alone
+    assert found.bias == -3.0
     assert found.slope == pytest.approx(-0.2, abs=1e-3)
+    assert found.weights == pytest.approx((0.0, 0.0), abs=1e-6)
+    few = spread._replace(twist=draw_true(10, torch.Generator().manual_seed(0)))
+    found = fit_belief_scale(few, torch.full((10,), 0.5), torch.zeros(10, 2))
+    assert found is not None
+    shape = found.find_factor(torch.tensor([0.5]), torch.zeros(1, 2)) ** 2 * found.find_shape(
+        spread.scatter[0]
+    )
+    # errors as the particles say: within a factor of two along each axis
+    assert float(torch.linalg.eigvalsh(shape).log().abs().max()) < 2 * math.log(2)
 
 
 def test_the_factor_is_limited_to_what_frames_can_tell() -> None:
@@ -328,7 +378,7 @@ def test_what_speaks_for_an_estimate_tells_how_wide_its_belief_is() -> None:
     factor = found.find_factor(torch.full((2,), 0.5), torch.tensor([[1.0, 0.0], [-1.0, 9.0]]))
     assert float((factor[1] / factor[0]).log()) == pytest.approx(0.8, abs=0.2)
     far = found.find_factor(torch.zeros(2), torch.tensor([[99.0, 0.0], [-99.0, 0.0]]))
-    assert far.log().tolist() == [-2.0, 2.0]
+    assert far.log().tolist() == [-3.0, 3.0]
 
 
 def calibration(belief_scale: BeliefScale | None) -> Calibration:
@@ -359,7 +409,7 @@ def test_the_factor_goes_by_the_default_tolerance_whatever_the_verdict_goes_by()
 
 def test_a_scale_is_stored_and_read_and_older_calibrations_have_none() -> None:
     plain = calibration(BeliefScale(-0.25, -0.125)).to_plain()
-    usual = {"bias": -0.25, "slope": -0.125, "weights": [], "degrees": 5}
+    usual = {"bias": -0.25, "slope": -0.125, "weights": [], "degrees": 5, "common": []}
     assert plain["belief_scale"] == usual
     assert read_calibration(plain, "x").belief_scale == BeliefScale(-0.25, -0.125)
     plain = calibration(BeliefScale(-0.25, -0.125, (0.5,), 3)).to_plain()
@@ -370,7 +420,11 @@ def test_a_scale_is_stored_and_read_and_older_calibrations_have_none() -> None:
             read_calibration(plain, "x")
     del plain["belief_scale"]["degrees"]
     assert read_calibration(plain, "x").belief_scale == BeliefScale(-0.25, -0.125, (0.5,))
-    del plain["belief_scale"]["weights"]  # of an earlier version
+    whole = BeliefScale(-0.25, -0.125, (0.5,), 3, tuple(0.01 * k for k in range(21)))
+    assert read_calibration(calibration(whole).to_plain(), "x").belief_scale == whole
+    del plain["belief_scale"]["common"]  # of an earlier version
+    assert read_calibration(plain, "x").belief_scale == BeliefScale(-0.25, -0.125, (0.5,))
+    del plain["belief_scale"]["weights"]
     assert read_calibration(plain, "x").belief_scale == BeliefScale(-0.25, -0.125)
     del plain["belief_scale"]
     assert read_calibration(plain, "x").belief_scale is None
@@ -391,6 +445,10 @@ def test_a_scale_is_stored_and_read_and_older_calibrations_have_none() -> None:
         {"bias": 0.0, "slope": 0.0, "weights": [0.0, 0.0]},
         {"bias": 0.0, "slope": 0.0, "weights": [math.inf]},
         {"bias": 0.0, "slope": 0.0, "weights": [20.0]},
+        {"bias": 0.0, "slope": 0.0, "common": [0.0] * 20},
+        {"bias": 0.0, "slope": 0.0, "common": [math.nan] * 21},
+        {"bias": 0.0, "slope": 0.0, "common": [1e3] * 21},
+        {"bias": 0.0, "slope": 0.0, "common": [-1e3] * 21},
     ],
 )
 def test_a_scale_that_is_none_is_refused(content: object) -> None:

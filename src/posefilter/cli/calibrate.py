@@ -225,6 +225,25 @@ def learn(
     if method.filter.max_searches > 1:
         method.calibration = first = fit_choice(frames, source)
         frames, beliefs, _ = collect_frames(method, present, absent, console, answers)
+    return fit_answers(frames, beliefs, first, method.object_model, source)
+
+
+def fit_answers(
+    frames: Frames,
+    beliefs: Beliefs,
+    first: Calibration | None,
+    object_model: ObjectModel,
+    source: str,
+) -> Calibration:
+    """Fit a calibration to the answers that were chosen.
+
+    Args:
+        frames: With the object and without.
+        beliefs: Of those with it.
+        first: What answers were compared by; None: each image has one answer.
+        object_model: The object.
+        source: The kind of data that the frames are of.
+    """
     held = cross_validate(frames, first=first)
     scores = measure_quality(frames, held)
     quality = {key: float(scores[key]) for key in _SHOWN if math.isfinite(scores[key])}
@@ -232,7 +251,7 @@ def learn(
     nonconformity = np.full(len(own), np.nan)
     features = torch.from_numpy(standardize_frames(frames, first)[own])
     scale, nonconformity[own] = fit_beliefs(
-        beliefs, held.probability[own], features, frames.correct[own], method.object_model
+        beliefs, held.probability[own], features, frames.correct[own], object_model
     )
     frames = frames._replace(nonconformity=nonconformity)
     return fit_calibration(frames, source, quality, first, scale)

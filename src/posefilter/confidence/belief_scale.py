@@ -2,12 +2,14 @@
 
 The particles of a finished filter surround the estimate, and their second moment C about it says in
 which directions it is uncertain.  Its size is that of the filter's last noise level rather than of
-the estimate's error: refinements move the estimate and not the particles.  The calibration frames
-tell the size.  The error of a right estimate, a twist e (6,), is modeled as Student's t:
+the estimate's error: refinements move the estimate and not the particles.  What a refinement leaves
+has a shape of its own, much the same in every image: a matrix F.  The calibration frames tell both
+the size and F.  The error of a right estimate, a twist e (6,), is modeled as Student's t:
 
-    e ~ t_n(0, s^2 C),    log s = bias + slope * logit(probability) + weights . features
+    e ~ t_n(0, s^2 (C + F)),    log s = bias + slope * logit(probability) + weights . features
 
-with numbers that maximize the posterior over the frames whose estimate is right.  The degrees of
+with numbers that maximize the posterior over the frames whose estimate is right.  Where particles
+are close together F decides, and where they spread, as they do under occlusion, C.  The degrees of
 freedom n are 5, or 3 or 8 where these explain the frames clearly better: an alignment that succeeds
 in most frames, and not in all, leaves errors with heavier tails.  The features are
 those of the calibration, standardized by it: by the probability alone beliefs would be as wide as
@@ -37,14 +39,18 @@ POSSIBLE_DEGREES = (3, 5, 8)
 _CLEARLY = 3.0  # [nat] by which other degrees of freedom must explain the frames better
 _LOGIT = 5.0  # beyond, on either side, frames are too few to tell more
 # mean and standard deviation of the prior, near the mean and the spread of ten objects' own fits
-_BIAS, _SLOPE = (-0.2, 0.5), (-0.2, 0.1)
+_BIAS, _SLOPE = (-0.5, 1.0), (-0.2, 0.1)
+# of F's Cholesky factor, in units of the mean size of C: of the log of its diagonal, and the
+# deviation of the rest in units of that diagonal
+_DIAGONAL, _REST = (-0.2, 1.0), 0.5
 _WEIGHT = 0.1  # standard deviation of the prior of a weight, times that of its feature
 _LEAST_SPREAD = 0.05  # of a feature: one that is nearly constant says nothing of the width
-_MOST = 2.0  # of the log of the factor: features beyond those that were seen say no more
+_MOST = 3.0  # of the log of the factor: features beyond those that were seen say no more
 # before any particle an error of so many diameters, a turn as the shift at the radius, counts as
 # much as so many particles: C has full rank also where few are near the estimate
 _PRIOR_ERROR, _PRIOR_COUNT = 0.03, 4.0
 _FEWEST_PARTICLES, _FEWEST_DRAWS = 200, 32
+TRIANGLE = 21  # numbers of a triangle of 6 x 6
 # by degrees of freedom: of 300, that whose draws' lengths are nearest to the distribution's
 _SEEDS = {3: 2, 5: 197, 8: 157}
 
@@ -59,12 +65,15 @@ class BeliefScale:
         slope: By how much it rises with the probability's logit.
         weights: By how much it rises with each standardized feature; none: of an earlier version.
         degrees: Of freedom, of Student's t.
+        common: F by the lower triangle of its Cholesky factor, row by row [m], a turn as the shift
+            at the object's radius, 21 numbers; none: of an earlier version, whose F is zero.
     """
 
     bias: float
     slope: float
     weights: tuple[float, ...] = ()
     degrees: int = DEGREES
+    common: tuple[float, ...] = ()
 
     def find_factor(self, probability: Tensor, features: Tensor) -> Tensor:
         """Return the factors of B estimates.
@@ -77,6 +86,13 @@ class BeliefScale:
         if self.weights:
             log_factor = log_factor + features.double() @ log_factor.new_tensor(self.weights)
         return log_factor.clamp(-_MOST, _MOST).exp()
+
+    def find_shape(self, scatter: Tensor) -> Tensor:
+        """Return C + F of the scatter C of particles.  (*, 6, 6) [m^2] -> (*, 6, 6), float64."""
+        if not self.common:
+            return scatter
+        factor = _fill_triangle(scatter.new_tensor(self.common))
+        return scatter + factor @ factor.mT
 
 
 class PoseSpread(NamedTuple):
@@ -120,28 +136,54 @@ def fit_belief_scale(
     if len(probability) < FEWEST_RIGHT:
         return None
     logit = _limit_logit(probability)
-    x = torch.column_stack([torch.ones_like(logit), logit, features.double()]).numpy()
-    within = torch.linalg.solve(spread.scatter, spread.twist[..., None])[..., 0]
-    distance = (within * spread.twist).sum(-1).numpy()  # squared, of Mahalanobis
-    mean = np.array([_BIAS[0], _SLOPE[0], *[0.0] * features.shape[1]])
-    own_spread = x[:, 2:].std(axis=0).clip(_LEAST_SPREAD)
-    deviation = np.array([_BIAS[1], _SLOPE[1], *(_WEIGHT / own_spread)])
+    x = torch.column_stack([torch.ones_like(logit), logit, features.double()])
+    count = x.shape[1]  # of what the scale depends on; what decides F follows
+    unit = float(torch.linalg.slogdet(spread.scatter)[1].div(12).mean().exp())  # of length
+    twist, scatter = spread.twist / unit, spread.scatter / unit**2
+    own_spread = x[:, 2:].var(0, correction=0).sqrt().clamp_min(_LEAST_SPREAD)
+    is_diagonal = _fill_triangle(torch.arange(TRIANGLE)).diagonal()
+    mean = torch.zeros(count + TRIANGLE, dtype=torch.float64)
+    mean[0], mean[1] = _BIAS[0], _SLOPE[0]
+    mean[count + is_diagonal] = _DIAGONAL[0]
+    deviation = torch.full_like(mean, _REST)
+    deviation[0], deviation[1] = _BIAS[1], _SLOPE[1]
+    deviation[2:count] = _WEIGHT / own_spread
+    deviation[count + is_diagonal] = _DIAGONAL[1]
+
+    # errors of exactly 0, which have no scale, do not take it to where none is
+    bounds = [(-_MOST, _MOST), *[(None, None)] * (len(mean) - 1)]
+
+    def find_root(w: Tensor) -> Tensor:
+        """Return the Cholesky factor of F, (6, 6), in units of the mean size of C."""
+        lower = _fill_triangle(w[count:])
+        diagonal = lower.diagonal().exp()
+        return diagonal[:, None] * (lower.tril(-1) + torch.eye(6, dtype=lower.dtype))
 
     def negative_log_posterior(w: np.ndarray, degrees: int) -> tuple[float, np.ndarray]:
         """Return it up to a constant, the same for all degrees of freedom, and its gradient."""
-        log_factor = x @ w
-        ratio = distance * np.exp(-2 * log_factor) / degrees
+        at = torch.from_numpy(w).requires_grad_()
+        log_factor, root = x @ at[:count], find_root(at)
+        lower = torch.linalg.cholesky(scatter + root @ root.mT)
+        within = torch.linalg.solve_triangular(lower, twist[..., None], upper=False)[..., 0]
+        ratio = within.square().sum(-1) * (-2 * log_factor).exp() / degrees
         constant = math.lgamma(degrees / 2) - math.lgamma(degrees / 2 + 3) + 3 * math.log(degrees)
-        own = constant + 6 * log_factor + 0.5 * (degrees + 6) * np.log1p(ratio)
-        slopes = 6 - (degrees + 6) * ratio / (1 + ratio)
-        away = (w - mean) / deviation
-        return float(own.sum() + 0.5 * np.square(away).sum()), slopes @ x + away / deviation
+        own = constant + 6 * log_factor + lower.diagonal(dim1=1, dim2=2).log().sum(1)
+        own = own + 0.5 * (degrees + 6) * torch.log1p(ratio)
+        cost = own.sum() + 0.5 * ((at - mean) / deviation).square().sum()
+        cost.backward()
+        assert at.grad is not None
+        return float(cost.detach()), at.grad.numpy()
 
     def fit(degrees: int) -> tuple[float, BeliefScale]:
         """Return the negative log-posterior at its minimum, and where that is."""
-        found = minimize(negative_log_posterior, mean, (degrees,), jac=True, method="BFGS")
-        bias, slope, *weights = found.x.tolist()
-        return float(found.fun), BeliefScale(bias, slope, tuple(weights), degrees)
+        start = mean.numpy()
+        found = minimize(
+            negative_log_posterior, start, (degrees,), "L-BFGS-B", jac=True, bounds=bounds
+        )
+        bias, slope, *weights = found.x[:count].tolist()
+        lower = unit * find_root(torch.from_numpy(found.x))
+        common = tuple(lower[torch.tril_indices(6, 6).unbind()].tolist())
+        return float(found.fun), BeliefScale(bias, slope, tuple(weights), degrees, common)
 
     fits = {degrees: fit(degrees) for degrees in POSSIBLE_DEGREES}
     cost, usual = fits[DEGREES]
@@ -174,7 +216,7 @@ def calibrate_belief(
     factors = scale.find_factor(probability.detach().cpu(), features.detach().cpu())
     count = max(belief.log_weights.shape[1], _FEWEST_PARTICLES)
     rows = [
-        _redraw(belief, i, float(factor), count, object_model, scale.degrees)
+        _redraw(belief, i, float(factor), count, object_model, scale)
         for i, factor in enumerate(factors)
     ]
     poses, log_weights, draws = zip(*rows, strict=True)
@@ -186,7 +228,12 @@ def calibrate_belief(
 
 
 def _redraw(
-    belief: BeliefBatch, i: int, factor: float, count: int, object_model: ObjectModel, degrees: int
+    belief: BeliefBatch,
+    i: int,
+    factor: float,
+    count: int,
+    object_model: ObjectModel,
+    scale: BeliefScale,
 ) -> tuple[Tensor, Tensor, int]:
     """Return the poses (count, 4, 4) and log weights (count,) of one calibrated belief, float64,
     and how many of the first are draws.
@@ -202,8 +249,8 @@ def _redraw(
     rest = count - own
     if own == _FEWEST_DRAWS or not rest:  # few particles are near the estimate, or all are
         mass = max(mass, own / count)
-    draws = factor * draw_student_t(own, degrees)
-    twist = draws @ torch.linalg.cholesky(scatter).mT / _unit(object_model)
+    draws = factor * draw_student_t(own, scale.degrees)
+    twist = draws @ torch.linalg.cholesky(scale.find_shape(scatter)).mT / _unit(object_model)
     drawn = _turn_between(
         move_about(best, twist, object_model.center.detach().cpu().double()), object_model
     )
@@ -283,6 +330,13 @@ def _twist_near(best: Tensor, poses: Tensor, object_model: ObjectModel) -> Tenso
     )
     copies = gather_copies(poses, best, center, object_model.radius, densify(group))
     return twist_between(best, copies, center)
+
+
+def _fill_triangle(values: Tensor) -> Tensor:
+    """Return a lower triangular matrix by its rows.  (21,) -> (6, 6)."""
+    lower = values.new_zeros(6, 6)
+    lower[torch.tril_indices(6, 6).unbind()] = values
+    return lower
 
 
 def _limit_logit(probability: Tensor) -> Tensor:

@@ -21,7 +21,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from posefilter.confidence.belief_scale import DEGREES, POSSIBLE_DEGREES, BeliefScale
+from posefilter.confidence.belief_scale import DEGREES, POSSIBLE_DEGREES, TRIANGLE, BeliefScale
 from posefilter.confidence.conformal import GROUPED_BY, Conformal
 from posefilter.confidence.logistic import Logistic, fit_logistic
 from posefilter.confidence.tolerance import RIGHT, PoseErrors, PoseTolerance
@@ -33,6 +33,7 @@ _MOST_FEATURES, _LARGEST, _MOST_FRAMES = 16, 1e6, 10_000_000
 _MOST_GROUPS, _MOST_SCORES = 16, 100_000
 _MOST_LOG = 10.0  # of a belief's scale
 _FARTHEST = 60_000.0  # error that float16 holds
+_FARTHEST_COMMON = 100.0  # [m], of the error that all estimates have in common
 _RENAMED = {  # features, by their names in earlier versions
     "solid": "free_space",
     "explained": "mask_precision",
@@ -293,10 +294,10 @@ def _logistic(content: Any, count: int, name: str) -> Logistic:
 
 
 def _belief_scale(content: Any, count: int) -> BeliefScale:
-    # earlier versions have no weights, and the usual degrees of freedom
-    later = {"weights", "degrees"}
+    # earlier versions have no weights, the usual degrees of freedom, and a shape of the particles
+    later = {"weights", "degrees", "common"}
     if not isinstance(content, dict) or set(content) - later != {"bias", "slope"}:
-        raise ValueError("should have bias, slope, weights and degrees in belief_scale")
+        raise ValueError("should have bias, slope, weights, degrees and common in belief_scale")
     weights = content.get("weights", [])
     if not isinstance(weights, list) or len(weights) not in (0, count):
         raise ValueError(f"should have {count} weights in belief_scale")
@@ -307,7 +308,13 @@ def _belief_scale(content: Any, count: int) -> BeliefScale:
     degrees = content.get("degrees", DEGREES)
     if type(degrees) is not int or degrees not in POSSIBLE_DEGREES:
         raise ValueError(f"should have degrees of {POSSIBLE_DEGREES} in belief_scale")
-    return BeliefScale(numbers[0], numbers[1], numbers[2:], degrees)
+    common = content.get("common", [])
+    if not isinstance(common, list) or len(common) not in (0, TRIANGLE):
+        raise ValueError(f"should have {TRIANGLE} numbers in belief_scale's common")
+    lower = _numbers(common, len(common), "belief_scale's common", minimum=-_FARTHEST_COMMON)
+    if lower and max(lower) > _FARTHEST_COMMON:
+        raise ValueError("has numbers out of range in belief_scale's common")
+    return BeliefScale(numbers[0], numbers[1], numbers[2:], degrees, lower)
 
 
 def _errors(content: Any, count: int) -> CalibrationErrors:
