@@ -350,6 +350,13 @@ def test_ten_frames_do_not_take_a_fit_far_from_what_is_known_of_other_objects() 
     assert found.bias == -3.0
     assert found.slope == pytest.approx(-0.2, abs=1e-3)
     assert found.weights == pytest.approx((0.0, 0.0), abs=1e-6)
+    far = fit_belief_scale(
+        spread._replace(twist=torch.full_like(spread.twist, 1e4)),
+        torch.full((10,), 0.5),
+        torch.zeros(10, 2),
+    )
+    assert far is not None
+    assert np.isfinite(far.common).all()
     few = spread._replace(twist=draw_true(10, torch.Generator().manual_seed(0)))
     found = fit_belief_scale(few, torch.full((10,), 0.5), torch.zeros(10, 2))
     assert found is not None

@@ -43,6 +43,7 @@ _BIAS, _SLOPE = (-0.5, 1.0), (-0.2, 0.1)
 # of F's Cholesky factor, in units of the mean size of C: of the log of its diagonal, and the
 # deviation of the rest in units of that diagonal
 _DIAGONAL, _REST = (-0.2, 1.0), 0.5
+_FARTHEST = 10.0  # of these numbers from 0
 _WEIGHT = 0.1  # standard deviation of the prior of a weight, times that of its feature
 _LEAST_SPREAD = 0.05  # of a feature: one that is nearly constant says nothing of the width
 _MOST = 3.0  # of the log of the factor: features beyond those that were seen say no more
@@ -150,8 +151,9 @@ def fit_belief_scale(
     deviation[2:count] = _WEIGHT / own_spread
     deviation[count + is_diagonal] = _DIAGONAL[1]
 
-    # errors of exactly 0, which have no scale, do not take it to where none is
-    bounds = [(-_MOST, _MOST), *[(None, None)] * (len(mean) - 1)]
+    # errors of exactly 0 have no scale; and a step of the search must not go where nothing is finite
+    bounds = [(None, None)] * count + [(-_FARTHEST, _FARTHEST)] * TRIANGLE
+    bounds[0] = (-_MOST, _MOST)
 
     def find_root(w: Tensor) -> Tensor:
         """Return the Cholesky factor of F, (6, 6), in units of the mean size of C."""
