@@ -55,7 +55,8 @@ def test_the_better_model_gains(by_image: bool) -> None:
     right = np.arange(400) % 10 > 0
     twist[~right] += 1e3  # which no fit may have seen
     scene = np.repeat(np.arange(200), 2).astype(str)
-    found = Errors(twist, EVEN[:400], factor, right, rng.uniform(size=400), scene)
+    shipped = factor[:, None, None] ** 2 * EVEN[:400]
+    found = Errors(twist, EVEN[:400], shipped, right, rng.uniform(size=400), scene)
     said = compare(found, 5)
     gain = (said["one covariance"].log_density - said[SHIPPED].log_density)[right]
     _, low, high = bootstrap(gain, scene[right])

@@ -151,7 +151,7 @@ def fit_belief_scale(
     deviation[2:count] = _WEIGHT / own_spread
     deviation[count + is_diagonal] = _DIAGONAL[1]
 
-    # errors of exactly 0 have no scale; and no step of the search may go where not all is finite
+    # errors of exactly 0 have no scale; and F stays where its Cholesky factor is finite
     bounds = [(None, None)] * count + [(-_FARTHEST, _FARTHEST)] * TRIANGLE
     bounds[0] = (-_MOST, _MOST)
 
