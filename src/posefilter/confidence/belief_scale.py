@@ -89,7 +89,7 @@ class BeliefScale:
         return log_factor.clamp(-_MOST, _MOST).exp()
 
     def find_shape(self, scatter: Tensor) -> Tensor:
-        """Return C + F of the scatter C of particles.  (*, 6, 6) [m^2] -> (*, 6, 6), float64."""
+        """Return C + F of the scatter C of particles.  (*, 6, 6) [m^2] -> the same."""
         if not self.common:
             return scatter
         factor = _fill_triangle(scatter.new_tensor(self.common))
@@ -178,9 +178,8 @@ def fit_belief_scale(
 
     def fit(degrees: int) -> tuple[float, BeliefScale]:
         """Return the negative log-posterior at its minimum, and where that is."""
-        start = mean.numpy()
         found = minimize(
-            negative_log_posterior, start, (degrees,), "L-BFGS-B", jac=True, bounds=bounds
+            negative_log_posterior, mean.numpy(), (degrees,), "L-BFGS-B", jac=True, bounds=bounds
         )
         bias, slope, *weights = found.x[:count].tolist()
         lower = unit * find_root(torch.from_numpy(found.x))

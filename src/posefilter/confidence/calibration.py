@@ -302,18 +302,15 @@ def _belief_scale(content: Any, count: int) -> BeliefScale:
     if not isinstance(weights, list) or len(weights) not in (0, count):
         raise ValueError(f"should have {count} weights in belief_scale")
     given = [content["bias"], content["slope"], *weights]
-    numbers = _numbers(given, len(given), "belief_scale", minimum=-_MOST_LOG)
-    if max(numbers) > _MOST_LOG:
-        raise ValueError("has numbers out of range in belief_scale")
+    numbers = _numbers(given, len(given), "belief_scale", -_MOST_LOG, _MOST_LOG)
     degrees = content.get("degrees", DEGREES)
     if type(degrees) is not int or degrees not in POSSIBLE_DEGREES:
         raise ValueError(f"should have degrees of {POSSIBLE_DEGREES} in belief_scale")
     common = content.get("common", [])
     if not isinstance(common, list) or len(common) not in (0, TRIANGLE):
         raise ValueError(f"should have {TRIANGLE} numbers in belief_scale's common")
-    lower = _numbers(common, len(common), "belief_scale's common", minimum=-_FARTHEST_COMMON)
-    if lower and max(lower) > _FARTHEST_COMMON:
-        raise ValueError("has numbers out of range in belief_scale's common")
+    limits = (-_FARTHEST_COMMON, _FARTHEST_COMMON)
+    lower = _numbers(common, len(common), "belief_scale's common", *limits)
     return BeliefScale(numbers[0], numbers[1], numbers[2:], degrees, lower)
 
 
@@ -353,13 +350,15 @@ def _conformal(content: Any) -> Conformal:
     return Conformal(edges, tuple(read), by)
 
 
-def _numbers(values: Any, count: int, name: str, minimum: float = -_LARGEST) -> tuple[float, ...]:
+def _numbers(
+    values: Any, count: int, name: str, minimum: float = -_LARGEST, maximum: float = _LARGEST
+) -> tuple[float, ...]:
     """Return finite numbers of moderate size."""
     if not isinstance(values, list) or len(values) != count:
         raise ValueError(f"should have {count} numbers in {name}")
     for value in values:
         number = isinstance(value, int | float) and not isinstance(value, bool)
         # nan is in no range; a whole number may be too large for a float
-        if not (number and minimum <= value <= _LARGEST):
+        if not (number and minimum <= value <= maximum):
             raise ValueError(f"has {str(value)[:30]!r} in {name}")
     return tuple(float(value) for value in values)
