@@ -132,14 +132,14 @@ def measure_error(
     Returns:
         off: Translation of the center [m] and rotation [rad].  says: What `Belief.uncertainty`
         gives for them at 95 %.  within: Whether each is within it.  level: Of the smallest
-        ellipsoid that holds the truth, of the covariance about the estimate and in the shape of
-        Student's t.
+        ellipsoid that holds the truth, of `Belief.error_covariance` and in the shape of Student's
+        t.
     """
     lone = replace(belief, samples=truth[None], weights=np.ones(1), draws=0)
     near = lone.canonicalize(estimate)
     about = torch.from_numpy(estimate)
     twist = twist_between(about, torch.from_numpy(near.samples[0]), torch.from_numpy(belief.center))
-    error, spread = twist.numpy(), belief.covariance_about(estimate)
+    error, spread = twist.numpy(), belief.error_covariance(estimate)
     squared = float(error @ np.linalg.lstsq(spread, error, rcond=1e-9)[0])
     sure = belief.uncertainty()
     off = [float(np.linalg.norm(error[:3])), float(np.linalg.norm(error[3:]))]

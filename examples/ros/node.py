@@ -132,8 +132,7 @@ class PoseNode(Node):
 
 def make_detection(result: Result, header: object) -> Detection3D:
     """Return a result as a detection."""
-    belief = result.belief
-    covariance = to_ros_covariance(belief.covariance_about(result.pose), result.pose, belief.center)
+    covariance = to_ros_covariance(result.covariance, result.pose, result.belief.center)
     found = ObjectHypothesisWithPose()
     found.hypothesis.class_id = result.object
     found.hypothesis.score = choose_score(result)

@@ -175,11 +175,12 @@ class Result:
 
     @property
     def covariance(self) -> np.ndarray:
-        """The belief's covariance (6, 6) about its mean pose; see `Belief.covariance`.
+        """The covariance (6, 6) of the pose's error, if the pose is right: see
+        `Belief.error_covariance`.
 
-        That of the estimate's own error is `belief.covariance_about(pose)`.
+        That of the whole belief about its mean, other modes included, is `belief.covariance`.
         """
-        return self.belief.covariance
+        return self.belief.error_covariance(self.pose)
 
     @property
     def belief_calibrated(self) -> bool:

@@ -325,6 +325,23 @@ def test_the_covariance_about_a_pose_holds_its_offset_and_forgets_the_symmetry()
         belief_of(samples).covariance_about(samples[:2])
 
 
+def test_the_covariance_of_an_error_leaves_other_modes_out_where_draws_are_known() -> None:
+    pose = middle().numpy()
+    own, away = draw(400, 16), draw(100, 17)
+    away[:, 0, 3] += 0.2
+    weights = np.concatenate([np.full(400, 0.75 / 400), np.full(100, 0.25 / 100)])
+    samples = np.concatenate([own, away])
+    calibrated = belief_of(samples, weights, draws=400)
+    alone = belief_of(own).covariance_about(pose)
+    assert np.allclose(calibrated.error_covariance(pose), alone, rtol=1e-9, atol=1e-15)
+    about = calibrated.covariance_about(pose)
+    assert about[0, 0] == pytest.approx(0.25 * 0.2**2, rel=0.05)
+    plain = belief_of(samples, weights)  # nothing tells which samples are the estimate's
+    assert np.array_equal(plain.error_covariance(pose), about)
+    with pytest.raises(UserError, match="poses: should be rigid"):
+        calibrated.error_covariance(2 * np.eye(4))
+
+
 def test_a_canonical_belief_is_the_same_belief_in_one_place() -> None:
     samples = draw(200, 16)
     turned = samples.copy()

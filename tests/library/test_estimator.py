@@ -79,7 +79,8 @@ def test_an_answer_is_that_of_the_command(estimator: posefilter.Estimator, tmp_p
     assert told["belief"]["weight_entropy"] == pytest.approx(own.weight_entropy)
     assert told["belief"]["differential_entropy"] == pytest.approx(own.differential_entropy)
     assert told["belief"]["entropy"] == told["belief"]["weight_entropy"]  # the earlier name stays
-    assert np.allclose(told["belief"]["covariance"], result.covariance)
+    assert np.allclose(told["belief"]["covariance"], own.covariance)
+    assert np.allclose(told["belief"]["error_covariance"], result.covariance)
     assert told["belief_file"] == str(tmp_path / "belief.npz")
     assert told["score_is"] == estimator.methods[0].filter.score_is
     assert told["warnings"] == [] == list(result.warnings)
@@ -183,8 +184,10 @@ def test_the_box_is_where_it_was_rendered(estimator: posefilter.Estimator) -> No
 
 def test_a_wrong_depth_scale_is_reported(estimator: posefilter.Estimator) -> None:
     rgb, depth, K = read_scene()
-    (warning,) = estimator.predict(rgb, 10 * depth, K).warnings
-    assert "depth_scale" in warning
+    # of what is found there the size may be told, too
+    warnings = estimator.predict(rgb, 10 * depth, K).warnings
+    assert "median depth" in warnings[0]
+    assert all("depth_scale" in warning for warning in warnings)
 
 
 def test_a_depth_that_is_a_fourth_too_large_is_measured_and_not_believed(

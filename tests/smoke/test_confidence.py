@@ -276,7 +276,7 @@ def test_a_belief_is_as_wide_as_the_calibration_says_in_results_files_and_metric
     narrow, wide = (load(file, device="cpu").predict(rgb, depth, K) for file in there)
     assert [one.belief_calibrated for one in (plain, narrow, wide)] == [False, True, True]
     assert narrow.pose.tolist() == wide.pose.tolist() == plain.pose.tolist()
-    shares = [result.belief.covariance_about(result.pose) for result in (narrow, wide)]
+    shares = [result.covariance for result in (narrow, wide)]
     assert np.diag(shares[1])[:3].sum() > np.diag(shares[0])[:3].sum()
     several = load(there[0], device="cpu").predict(rgb, depth, K, instances=1)
     assert several

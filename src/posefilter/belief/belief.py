@@ -131,15 +131,15 @@ class Belief:
         Rows and columns are [x, y, z, rx, ry, rz]: the translation of the object's center in the
         camera's axes [m], then the rotation vector about that center in the object's own axes
         [rad].  Square roots of the diagonal are standard deviations.  An estimate is not the mean:
-        for its error see `covariance_about`.
+        for its error see `error_covariance`.
         """
         samples, weights = self._tensors
         mean = torch.from_numpy(self.mean)
         return covariance_about(mean, samples, weights, torch.from_numpy(self.center)).numpy()
 
     def covariance_about(self, pose: np.ndarray) -> np.ndarray:
-        """Return the covariance (6, 6) of a pose's error, if the belief is right: the second moment
-        of the twists from this pose to the particles.
+        """Return the covariance (6, 6) of a pose's error, if the belief is right, other modes
+        included: the second moment of the twists from this pose to the particles.
 
         Unlike `covariance` it holds how far the pose is from the mean, and of each particle it
         takes the equivalent pose that is nearest.  Order, axes and units are those of `covariance`.
@@ -153,6 +153,25 @@ class Belief:
         near = self.canonicalize(pose)
         about, center = torch.from_numpy(_as_pose(pose)), torch.from_numpy(self.center)
         return covariance_about(about, *near._tensors, center).numpy()
+
+    def error_covariance(self, pose: np.ndarray) -> np.ndarray:
+        """Return the covariance (6, 6) of an estimate's error if the estimate is right.
+
+        Of a calibrated belief it is that of the draws about the estimate: its other modes are what
+        is true if the estimate is wrong.  Otherwise it is `covariance_about`.  Order, axes and
+        units are those of `covariance`.
+
+        Args:
+            pose: The estimate, (4, 4) camera_from_object [m], `Result.pose`; or (3, 4).
+
+        Raises:
+            UserError: It is no rigid transform.
+        """
+        if not self.draws:
+            return self.covariance_about(pose)
+        weights = self.weights[: self.draws] / self.weights[: self.draws].sum()
+        own = replace(self, samples=self.samples[: self.draws], weights=weights)
+        return own.covariance_about(pose)
 
     def canonicalize(self, pose: np.ndarray) -> "Belief":
         """Return the same belief by other samples: of each particle the equivalent pose that is

@@ -66,6 +66,7 @@ _COVARIANCE = (
     "about the mean pose: x, y, z of the object's center in the camera's axes [m], then the "
     "rotation vector about it in the object's own axes [rad]"
 )
+_ERROR_COVARIANCE = "of the pose's error, if the pose is right; axes and units as of covariance"
 
 
 def predict(job: Job) -> None:
@@ -300,6 +301,8 @@ def describe_belief(result: Result) -> dict[str, Any]:
         "mean": belief.mean.tolist(),
         "covariance": belief.covariance.tolist(),
         "covariance_is": _COVARIANCE,
+        "error_covariance": result.covariance.tolist(),
+        "error_covariance_is": _ERROR_COVARIANCE,
         "uncertainty": describe_uncertainty(result),
         "modes": [
             {

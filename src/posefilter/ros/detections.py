@@ -83,10 +83,8 @@ def make_detections(results: Sequence[Result], header: Any) -> Any:
 
 
 def _make_detection(result: Result, header: Any) -> Any:
-    belief = result.belief
     # a consumer takes it for that of the pose beside it
-    own = belief.covariance_about(result.pose)
-    covariance = to_ros_covariance(own, result.pose, belief.center)
+    covariance = to_ros_covariance(result.covariance, result.pose, result.belief.center)
     center, (x, y, z) = measure_box(result)
     hypothesis = make_message(
         "vision_msgs/msg/ObjectHypothesis", class_id=result.object, score=choose_score(result)

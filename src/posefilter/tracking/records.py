@@ -40,7 +40,7 @@ class TrackSummary:
     particles: int
     seconds: float
     warnings: tuple[str, ...]
-    standard_deviations: list[float]  # as of `Belief.covariance` [m, rad]
+    standard_deviations: list[float]  # as of `Result.covariance` [m, rad]
 
 
 class TrackRow(NamedTuple):
