@@ -53,8 +53,9 @@ _MOST = 3.0  # of the log of the factor: features beyond those that were seen sa
 _PRIOR_ERROR, _PRIOR_COUNT = 0.03, 4.0
 _FEWEST_PARTICLES, _FEWEST_DRAWS = 200, 32
 TRIANGLE = 21  # numbers of a triangle of 6 x 6
-# by degrees of freedom: of 300, that whose draws' lengths are nearest to the distribution's
-_SEEDS = {3: 2, 4: 13, 5: 197, 6: 125, 8: 157}
+# by degrees of freedom: of 300, one whose draws have lengths near the distribution's, also those of
+# the translation and of the rotation alone
+_SEEDS = {3: 2, 4: 179, 5: 197, 6: 235, 8: 157}
 
 
 @dataclass(frozen=True)
