@@ -228,6 +228,22 @@ def test_the_degrees_of_freedom_are_found(degrees: int) -> None:
     assert float(size) == pytest.approx(0.5, rel=0.05)
 
 
+def test_a_widened_belief_has_errors_so_many_times_as_large() -> None:
+    (beliefs, _), probability = simulate(2, 2.0, slope=0)
+    scale = BeliefScale(-0.3, 0.0, common=tuple(0.01 * k for k in range(21)))
+    given = beliefs, probability, bare(probability), scale, model()
+    once, twice = calibrate_belief(*given)[0], calibrate_belief(*given, 2.0)[0]
+    assert torch.equal(once.best, twice.best)
+    for i in range(2):
+        # of the first draws, which are the same with either
+        first, second = (one.poses[i, :32, :3, 3] - one.best[i, :3, 3] for one in (once, twice))
+        center = model().center.double()
+        turned = [
+            (one.poses[i, :32, :3, :3] - one.best[i, :3, :3]) @ center for one in (once, twice)
+        ]
+        assert torch.allclose(second + turned[1], 2 * (first + turned[0]), atol=1e-9)
+
+
 def test_the_covariance_about_the_estimate_is_that_of_the_model() -> None:
     (beliefs, truth), probability = simulate(3, 2.0, slope=0)
     lower = torch.linalg.cholesky(ROOT @ ROOT.mT)

@@ -198,6 +198,7 @@ def calibrate_belief(
     features: Tensor,
     scale: BeliefScale,
     object_model: ObjectModel,
+    widening: float = 1.0,
 ) -> tuple[BeliefBatch, Tensor]:
     """Return beliefs that are as wide as the errors of right estimates are.
 
@@ -207,6 +208,7 @@ def calibrate_belief(
         features: (B, F) of each, standardized.
         scale: Of the calibration.
         object_model: The object.
+        widening: By how much the errors are larger than those that the calibration has seen.
 
     Returns:
         B beliefs of as many particles, 200 at least, with the same estimates and scores.  The
@@ -214,7 +216,7 @@ def calibrate_belief(
         estimate is not finite they are the particles alone.  And of each, how many of the first
         poses are draws about the estimate, (B,) int64.
     """
-    factors = scale.find_factor(probability.detach().cpu(), features.detach().cpu())
+    factors = widening * scale.find_factor(probability.detach().cpu(), features.detach().cpu())
     count = max(belief.log_weights.shape[1], _FEWEST_PARTICLES)
     rows = [
         _redraw(belief, i, float(factor), count, object_model, scale)

@@ -276,7 +276,7 @@ class PoseEstimator(Module):
         return self.calibration.assess(features, self.pose_tolerance)
 
     def calibrate_belief(
-        self, belief: BeliefBatch, assessment: Assessment | None
+        self, belief: BeliefBatch, assessment: Assessment | None, widening: float = 1.0
     ) -> tuple[BeliefBatch, Tensor | None]:
         """Return beliefs as wide as the errors of right estimates are (confidence/belief_scale.py).
 
@@ -284,6 +284,7 @@ class PoseEstimator(Module):
             belief: B beliefs, as the filter leaves them.
             assessment: What `assess` says of them; where it is None, or the calibration knows no
                 scale, beliefs are returned as they are.
+            widening: By how much the errors are larger than those of the calibrated filter.
 
         Returns:
             The beliefs; and of each, how many of the first poses are draws about the estimate,
@@ -296,7 +297,7 @@ class PoseEstimator(Module):
         right = self.calibration.assess(features).probability  # within the default tolerance
         standardized = self.calibration.standardize(features)
         scale = self.calibration.belief_scale
-        return calibrate_belief(belief, right, standardized, scale, self.object_model)
+        return calibrate_belief(belief, right, standardized, scale, self.object_model, widening)
 
     # -- training ----------------------------------------------------------------------------------
 
