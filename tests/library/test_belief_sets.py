@@ -336,7 +336,7 @@ def test_the_covariance_of_an_error_leaves_other_modes_out_where_draws_are_known
     assert np.allclose(calibrated.error_covariance(pose), alone, rtol=1e-9, atol=1e-15)
     about = calibrated.covariance_about(pose)
     assert about[0, 0] == pytest.approx(0.25 * 0.2**2, rel=0.05)
-    plain = belief_of(samples, weights)  # nothing tells which samples are the estimate's
+    plain = belief_of(samples, weights)  # whose draws are not known
     assert np.array_equal(plain.error_covariance(pose), about)
     with pytest.raises(UserError, match="poses: should be rigid"):
         calibrated.error_covariance(2 * np.eye(4))

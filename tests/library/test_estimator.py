@@ -184,7 +184,7 @@ def test_the_box_is_where_it_was_rendered(estimator: posefilter.Estimator) -> No
 
 def test_a_wrong_depth_scale_is_reported(estimator: posefilter.Estimator) -> None:
     rgb, depth, K = read_scene()
-    # of what is found there the size may be told, too
+    # others may follow, about the size of what is found there
     warnings = estimator.predict(rgb, 10 * depth, K).warnings
     assert "median depth" in warnings[0]
     assert all("depth_scale" in warning for warning in warnings)

@@ -150,9 +150,7 @@ class Belief:
         Raises:
             UserError: It is no rigid transform.
         """
-        near = self.canonicalize(pose)
-        about, center = torch.from_numpy(_as_pose(pose)), torch.from_numpy(self.center)
-        return covariance_about(about, *near._tensors, center).numpy()
+        return self._covariance_about(pose, len(self.weights))
 
     def error_covariance(self, pose: np.ndarray) -> np.ndarray:
         """Return the covariance (6, 6) of an estimate's error if the estimate is right.
@@ -167,11 +165,13 @@ class Belief:
         Raises:
             UserError: It is no rigid transform.
         """
-        if not self.draws:
-            return self.covariance_about(pose)
-        weights = self.weights[: self.draws] / self.weights[: self.draws].sum()
-        own = replace(self, samples=self.samples[: self.draws], weights=weights)
-        return own.covariance_about(pose)
+        return self._covariance_about(pose, self.draws or len(self.weights))
+
+    def _covariance_about(self, pose: np.ndarray, count: int) -> np.ndarray:
+        """Return the covariance (6, 6) about a pose of the first so many samples."""
+        samples, weights = (part[:count] for part in self.canonicalize(pose)._tensors)
+        about, center = torch.from_numpy(_as_pose(pose)), torch.from_numpy(self.center)
+        return covariance_about(about, samples, weights / weights.sum(), center).numpy()
 
     def canonicalize(self, pose: np.ndarray) -> "Belief":
         """Return the same belief by other samples: of each particle the equivalent pose that is

@@ -34,7 +34,7 @@ from posefilter.geometry.symmetries import densify, gather_copies
 from posefilter.types import BeliefBatch, ObjectModel
 
 FEWEST_RIGHT = 10  # frames with a right estimate that a fit takes
-DEGREES = 5  # of freedom: of 3, 5 and 8 the densest at held-out errors of ten objects
+DEGREES = 5  # of freedom, where frames are few, and of calibrations that do not say
 # of others, by how much they must explain the frames better than these: minus a log prior [nat]
 _DEGREES_COST = {3: 2.0, 4: 1.0, DEGREES: 0.0, 6: 1.0, 8: 2.0}
 POSSIBLE_DEGREES = tuple(_DEGREES_COST)
