@@ -113,6 +113,11 @@ PLAN = (
     Piece("some_in_time", "learning_time", (200,)),
     Piece("between", "learning_curve", (100, 400)),
     Piece("some_seeds", "learning_curve", (200,), (1, 2)),
+    Piece("few_in_time_seeds", "learning_time", (50,), (1, 2)),
+    Piece("many_in_time_seeds", "learning_time", (1000,), (1, 2)),
+    Piece("some_in_time_seeds", "learning_time", (200,), (1, 2)),
+    Piece("between_seeds", "learning_curve", (100, 400), (1, 2)),
+    Piece("between_in_time", "learning_time", (100, 400), (0, 1, 2)),
 )
 
 
