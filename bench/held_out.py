@@ -2,12 +2,17 @@
 
     python bench/held_out.py --root DIR --meshes DIR [--part test] [--images 48] \
         [--out ROWS.json] A.ckpt [B.ckpt ...]
+    python bench/held_out.py --root DIR --meshes DIR --part all --paired OLD/A.ckpt NEW/A.ckpt
     python bench/held_out.py --table ROWS.json   # only puts rows into docs/results/held_out.csv
 
 The scenes are those that training with data.split={train: 0.8, val: 0.05, test: 0.15} and seed 0
 holds out; with --part train, those that it learns from, without augmentation: the difference is
-what was learned by heart. Frames of a scene are alike, so that intervals resample scenes, not
-images (95 %, percentile bootstrap). With --out, rows are added to those of the file.
+what was learned by heart; with --part all, every one, of a dataset that nothing learned from.
+Frames of a scene are alike, so that intervals resample scenes, not images (95 %, percentile
+bootstrap). With --out, rows are added to those of the file.
+
+With --paired, each checkpoint but the first of its object also has the difference to that one on
+the same images.
 
 Objects that the frame cuts off, and those whose pixels are few, have figures of their own.
 
@@ -19,8 +24,9 @@ import csv
 import json
 import sys
 from collections.abc import Mapping, Sequence
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -38,6 +44,7 @@ from posefilter.metrics.scores import auc
 
 ROWS = HOME / "docs" / "results" / "held_out.csv"
 SPLIT = {"train": 0.8, "val": 0.05, "test": 0.15}
+ALL = "all"
 LEAST = 0.3  # visible share
 # by whose definition it is; rows of the file that are "in the frame" count no truncation
 VISIBILITY = "BOP"
@@ -50,6 +57,14 @@ KINDS = {"whole": "in frame", "cut": "truncated", "small": "small"}
 HEAD += tuple(f"{k}: {what}" for k in KINDS.values() for what in ("images", "ADD AUC", "ADD-S AUC"))
 
 
+class Errors(NamedTuple):
+    """Of a checkpoint's estimates [m]."""
+
+    plain: torch.Tensor  # (N,) ADD
+    symmetric: torch.Tensor  # (N,) ADD-S
+    limit: float  # below which an ADD is right
+
+
 def read_frames(
     root: str,
     meshes: str,
@@ -59,6 +74,8 @@ def read_frames(
     split: Mapping[str, float] = SPLIT,
 ) -> list[tuple[str, Sample]]:
     """Return the scene and the sample of evenly chosen frames of a part that show the object."""
+    if part == ALL:
+        part, split = "test", {"train": 0.0, "val": 0.0, "test": 1.0}
     reader = open_reader("fat", root, None, open_meshes(meshes, None, "fat", [name]))
     records: Sequence[FrameRecord] = reader.records()
     chosen = split_records(records, split, 0, Path(root))[part]
@@ -119,8 +136,8 @@ def name_weights(checkpoint: str) -> str:
 
 def test(
     checkpoint: str, frames: Sequence[tuple[str, Sample]], points: torch.Tensor
-) -> dict[str, Any]:
-    """Return the row of one checkpoint.  points (P, 3) [m]."""
+) -> tuple[dict[str, Any], Errors]:
+    """Return the row of one checkpoint, and its errors.  points (P, 3) [m]."""
     estimator = posefilter.load(checkpoint, device="cpu")
     model = estimator.object_models[0]
     results = [estimator.predict(s.rgb, s.depth, s.intrinsics) for _, s in frames]
@@ -129,7 +146,7 @@ def test(
     scenes = [scene for scene, _ in frames]
     plain, symmetric = (f(poses, truth, points) for f in (add, add_s))
     recall = [float((e < 0.1 * model.diameter).double().mean()) for e in (plain, symmetric)]
-    return {
+    row = {
         "object": model.name,
         "weights": name_weights(checkpoint),
         "images": len(frames),
@@ -143,6 +160,25 @@ def test(
         "median_mm": 1000 * float(plain.median()),
         "kinds": measure_kinds([kind_of(s.mask > 0) for _, s in frames], plain, symmetric),
     }
+    return row, Errors(plain, symmetric, 0.1 * model.diameter)
+
+
+def _gain(a: torch.Tensor, b: torch.Tensor, rows: Sequence[int]) -> float:
+    return auc(b[rows]) - auc(a[rows])
+
+
+def compare(scenes: Sequence[str], first: Errors, other: Errors) -> str:
+    """Return by how much the areas of one checkpoint are above another's, and how many of each are
+    right.
+
+    scenes: (N,) names, of each image.
+    """
+    cells = []
+    for a, b in ((first.plain, other.plain), (first.symmetric, other.symmetric)):
+        low, high = bootstrap_scenes(scenes, partial(_gain, a, b))
+        cells.append(f"{auc(b) - auc(a):+.1f} [{low:.1f}, {high:.1f}]")
+    right = [int((one.plain < one.limit).sum()) for one in (first, other)]
+    return format_row(["difference: ADD AUC, ADD-S AUC, right", *cells, "{}, {}".format(*right)])
 
 
 def make_line(row: dict[str, Any]) -> str:
@@ -198,7 +234,8 @@ def main() -> int:
     parser.add_argument("--root", help="a dataset of bench/photographs.py, in FAT's format")
     parser.add_argument("--meshes", help="its meshes")
     parser.add_argument("--images", type=int, default=48)
-    parser.add_argument("--part", default="test", choices=list(SPLIT))
+    parser.add_argument("--part", default="test", choices=[*SPLIT, ALL])
+    parser.add_argument("--paired", action="store_true")
     parser.add_argument("--out", type=Path, help="a file that the rows are added to")
     parser.add_argument("--table", type=Path, help=f"a file of rows to put into {ROWS.name}")
     options = parser.parse_args()
@@ -211,13 +248,18 @@ def main() -> int:
     keep_freed_memory()
     points = choose_points(options.checkpoints)
     frames: dict[str, list[tuple[str, Sample]]] = {}
+    firsts: dict[str, Errors] = {}
     for checkpoint in options.checkpoints:
         name = posefilter.load(checkpoint, device="cpu").objects[0]
         if name not in frames:
             where = (options.root, options.meshes)
             frames[name] = read_frames(*where, name, options.images, options.part)
-        row = test(checkpoint, frames[name], points[name]) | {"part": options.part}
+        row, errors = test(checkpoint, frames[name], points[name])
+        row |= {"part": options.part}
         print(make_line(row), make_part_line(row), sep="\n", flush=True)
+        first = firsts.setdefault(name, errors)
+        if options.paired and first is not errors:
+            print(compare([scene for scene, _ in frames[name]], first, errors), flush=True)
         if options.out:
             rows = json.loads(options.out.read_text()) if options.out.is_file() else []
             options.out.write_text(json.dumps([*rows, row], indent=1))

@@ -70,3 +70,19 @@ def test_the_file_in_the_docs_stays_as_it_is_without_rows(
     assert copy.read_bytes() == held_out.ROWS.read_bytes()
     with copy.open(newline="") as file:
         assert {len(cells) for cells in csv.reader(file)} == {len(held_out.HEAD)}
+
+
+def test_two_checkpoints_are_compared_on_the_same_images(held_out: ModuleType) -> None:
+    scenes = [f"scene{i // 2}" for i in range(40)]
+    worse = (torch.arange(40) + 0.5) / 1000
+    first = held_out.Errors(worse, torch.zeros(40), 0.02)
+    same = held_out.compare(scenes, first, first)
+    assert "+0.0 [0.0, 0.0]" in same
+    better = held_out.compare(scenes, first, held_out.Errors(worse / 2, torch.zeros(40), 0.02))
+    cells = [cell.strip() for cell in better.strip("|").split("|")]
+    gain, low, high = (
+        float(x) for x in cells[1].replace("[", "").strip("]").replace(",", "").split()
+    )
+    assert 5 < low < gain < high < 15
+    assert gain == pytest.approx(10.25, abs=1.5)
+    assert cells[3] == "20, 40"
