@@ -197,6 +197,18 @@ def test_the_choice_ranks_answers_by_what_makes_them_right() -> None:
     assert read_calibration(last.to_plain(), "x") == last
 
 
+def test_answers_are_not_compared_by_how_clearly_the_texture_decides() -> None:
+    frames = draw(2000)
+    named = frames._replace(features=("texture_margin", "b", "texture_density"))
+    first = fit_choice(named, "scenes")
+    assert first.choice is not None
+    assert [weight > 0 for weight in first.choice.weights] == [False, True, False]
+    assert first.success.weights[0] > 0.5
+    kept = fit_choice(frames._replace(values=frames.values[:, [1]], features=("b",)), "scenes")
+    assert kept.choice is not None
+    np.testing.assert_allclose(first.choice.weights[1], kept.choice.weights[0], atol=1e-4)
+
+
 def test_a_calibration_of_an_earlier_version_compares_no_answers() -> None:
     plain = fit_calibration(draw(200), "scenes").to_plain()
     del plain["choice"]

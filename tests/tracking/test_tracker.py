@@ -531,6 +531,38 @@ def test_the_print_decides_every_so_many_frames(every: int, due: list[int]) -> N
     assert asked == due
 
 
+@pytest.mark.parametrize(("every", "due"), [(4, [0, 1, 5, 9]), (0, [0, 1, 5, 9])])
+def test_the_textures_margin_is_measured_now_and_then_and_kept(
+    every: int, due: list[int], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    toy, estimator = make_toy()
+    toy.calibration = Calibration(
+        ("score", "texture_margin"), (-5.0, 4.5), (2.0, 9.0), Logistic((3.0, 0.0), 0.0),
+        Logistic((0.0, 4.0), 0.0), {"right": 20, "wrong": 0, "absent": 20}, "toy", {},
+    )  # fmt: skip
+    collect, measured, now = toy.collect_features, [], [0]
+
+    def collect_with_margin(trace: Any, batch: Batch, margin: Any = None) -> dict[str, Any]:
+        if margin is None:
+            measured.append(now[0])
+            margin = torch.full((1,), float(now[0]))
+        return collect(trace, batch) | {"texture_margin": margin}
+
+    monkeypatch.setattr(toy, "collect_features", collect_with_margin)
+    settings = TrackerSettings(texture_every=every, whole_image_every=4)
+    tracker, probabilities = posefilter.Tracker(estimator, settings), []
+    for number, pose in enumerate(walk_pose(12)):
+        now[0], toy.truth = number, pose
+        probabilities.append(tracker.update(RGB, DEPTH, K).probability)
+    assert measured == due
+    risen = np.flatnonzero(np.diff(np.array(probabilities, float)) > 0.03) + 1
+    assert risen.tolist() == due[1:]
+    toy.truth, count = None, len(measured)
+    tracker.update(RGB, DEPTH, K)
+    assert [tracker.update(RGB, DEPTH, K).status for _ in range(5)][-1] == "lost"
+    assert len(measured) > count + 2  # a lost object's is of no use
+
+
 def test_after_a_loss_the_print_decides_among_all_turns() -> None:
     """The frame before tells nothing of them, so that those nearby are not asked for."""
     toy, estimator = make_toy()

@@ -11,6 +11,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from posefilter.confidence.texture_margin import measure_texture_margin
 from posefilter.filters.texture import coarsen_texture, measure_texture
 from posefilter.geometry.camera import project
 from posefilter.geometry.lookup import gather_pixels, nearest_pixel
@@ -22,6 +23,7 @@ from posefilter.types import Batch, BeliefBatch, ObjectModel
 
 _POINTS = 200  # of the surface: as many as exported weights carry
 _NOISE = 0.005  # [m] of the depth
+_FEW = 5  # points of the surface, so that one that is hardly seen is not all print
 _CELLS = 6  # of the network, that a small object covers
 _NEAREST = 0.01  # [m] points before the camera's plane
 
@@ -80,17 +82,37 @@ class _Image(NamedTuple):
     intrinsics: Tensor
 
 
-def measure_print(best: Tensor, batch: Batch, object_model: ObjectModel) -> dict[str, Tensor]:
-    """Return whether the image shows the object's print where poses (B, 4, 4) put it [m].
+def measure_print(
+    best: Tensor,
+    batch: Batch,
+    object_model: ObjectModel,
+    surface: Tensor,
+    margin: Tensor | None = None,
+) -> dict[str, Tensor]:
+    """Return whether the image shows the object's print where poses put it.
 
-    (B,) `texture`: the logarithm of one plus the evidence of the print [nat]. Nothing where the
-    object has no texture.
+    Args:
+        best: (B, 4, 4) camera_from_object [m].
+        batch: B images.
+        object_model: The object.
+        surface: (B,) as of `measure_depth`.
+        margin: (B,) `texture_margin` of earlier images, which is then not measured.
+
+    Returns:
+        (B,) each; nothing where the object has no texture. `texture`: the logarithm of one plus the
+        evidence of the print [nat]. `texture_density`: the same less the logarithm of `surface`,
+        since more of a surface that is seen should show more of its print. `texture_margin`: how
+        far the evidence is above that of other rotations; absent where the shape allows none.
     """
     if object_model.texture is None:
         return {}
     image = _Image(batch.rgb, batch.depth[:, 0], batch.intrinsics)
     evidence = measure_texture(best[:, None], image, coarsen_texture(object_model))[:, 0]
-    return {"texture": evidence.log1p()}
+    out = {"texture": evidence.log1p()}
+    out["texture_density"] = out["texture"] - (surface + _FEW / _POINTS).log()
+    if margin is None:
+        margin = measure_texture_margin(best, image, object_model, evidence)
+    return out if margin is None else {**out, "texture_margin": margin}
 
 
 def measure_coordinates(

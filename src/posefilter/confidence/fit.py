@@ -16,6 +16,9 @@ from posefilter.errors import UserError
 
 _FOLDS = 5  # of cross-validation
 FEWEST = 10  # frames with the object, and without
+# features that answers to one image are not compared by: they say how sure an answer is, and
+# whether they choose a better one was not tried
+_NOT_COMPARED = ("texture_density", "texture_margin")
 
 
 class Frames(NamedTuple):
@@ -71,7 +74,9 @@ def fit_choice(frames: Frames, source: str) -> Calibration:
     _check_counts(frames)
     fitted = _fit(frames, source, {})
     balance = _balance(frames.correct, float(np.clip(frames.correct.mean(), 0.05, 0.95)))
-    return replace(fitted, choice=fit_logistic(standardize_frames(frames), frames.correct, balance))
+    compared = [name not in _NOT_COMPARED for name in frames.features]
+    x = standardize_frames(frames) * compared  # of a feature that is always 0 the weight is 0
+    return replace(fitted, choice=fit_logistic(x, frames.correct, balance))
 
 
 def _balance(label: np.ndarray, share: float) -> np.ndarray:

@@ -383,7 +383,7 @@ class TextureRotations:
         evidence = measure_texture(poses, encoding, object_model, shift=0)
         top = (evidence + learned).topk(_MOST, dim=1).indices
         rows = torch.arange(len(best), device=best.device)[:, None]
-        angles = _angles(turns[first_tried], turns)
+        angles = rotation_angles(turns[first_tried], turns)
         beside = angles.topk(_BESIDE, dim=1, largest=False).indices  # itself first
         near = beside[top]  # (B, M, _BESIDE)
         around = best[:, None, None] @ turns[near]
@@ -411,7 +411,7 @@ class TextureRotations:
             encoding: The images.
             object_model: The object.
         """
-        angles = _angles(chosen, turns)  # (B, S)
+        angles = rotation_angles(chosen, turns)  # (B, S)
         most = int((angles < _APART).sum(1).max())
         if most == 1:
             return best @ chosen
@@ -437,7 +437,7 @@ def list_rotations(object_model: ObjectModel) -> tuple[Tensor, Tensor]:
     turns = object_model.shape_symmetries
     if object_model.texture is None or turns is None:
         raise UserError(_MISSING.format(name=object_model.name))
-    apart, chosen = _angles(turns, turns) > _APART - 0.1, []
+    apart, chosen = rotation_angles(turns, turns) > _APART - 0.1, []
     free = torch.ones_like(apart[0])  # of those that are chosen already
     while free.any():
         chosen.append(int(free.int().argmax()))  # the first
@@ -446,7 +446,7 @@ def list_rotations(object_model: ObjectModel) -> tuple[Tensor, Tensor]:
     return turns, torch.tensor(chosen, device=turns.device)
 
 
-def _angles(a: Tensor, b: Tensor) -> Tensor:
+def rotation_angles(a: Tensor, b: Tensor) -> Tensor:
     """Return the angles between turns [degrees].  (A, 4, 4), (B, 4, 4) -> (A, B)."""
     trace = rotation_of(a).flatten(1) @ rotation_of(b).flatten(1).mT
     return torch.rad2deg(((trace - 1) / 2).clamp(-1, 1).acos())

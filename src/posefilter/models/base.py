@@ -215,20 +215,25 @@ class PoseEstimator(Module):
         center = self.object_model.center.to(particles.state.device)
         return project(origin_of(particles.state, center), batch.intrinsics)
 
-    def collect_features(self, trace: Trace, batch: Batch) -> dict[str, Tensor]:
+    def collect_features(
+        self, trace: Trace, batch: Batch, margin: Tensor | None = None
+    ) -> dict[str, Tensor]:
         """Return what speaks for each estimate, by name.
 
         Args:
             trace: A finished run of the filter, or its last step alone.
             batch: Its B images; mask and pose are not used.
+            margin: (B,) `texture_margin` of earlier images of a track, which is then not measured.
 
         Returns:
             (B,) each; more of it speaks for the estimate.
         """
+        best, object_model = trace.belief.best, self.object_model
+        depth = measure_depth(best, batch, object_model)
         return {
-            **measure_belief(trace.belief, self.object_model),
-            **measure_depth(trace.belief.best, batch, self.object_model),
-            **measure_print(trace.belief.best, batch, self.object_model),
+            **measure_belief(trace.belief, object_model),
+            **depth,
+            **measure_print(best, batch, object_model, depth["surface"], margin),
         }
 
     def measure_apparent_size(self, trace: Trace, batch: Batch) -> ApparentSize | None:
@@ -266,13 +271,14 @@ class PoseEstimator(Module):
         return choose_part(self, image) if "pose_space" in self.capabilities else None
 
     @torch.no_grad()
-    def assess(self, trace: Trace, batch: Batch) -> Assessment | None:
+    def assess(self, trace: Trace, batch: Batch, margin: Tensor | None = None) -> Assessment | None:
         """Return the probabilities that the object is there and its pose right, None where the
         method is not calibrated; arguments as of `collect_features`.
         """
         if self.calibration is None:
             return None
-        features = self.collect_features(trace, batch)
+        known = () if margin is None else (margin,)
+        features = self.collect_features(trace, batch, *known)
         return self.calibration.assess(features, self.pose_tolerance)
 
     def calibrate_belief(

@@ -54,9 +54,11 @@ class PoseParticles(PoseEstimator):
         """The network of dense object coordinates, of those methods that have one."""
         return getattr(self, "proposals", None)
 
-    def collect_features(self, trace: Trace, batch: Batch) -> dict[str, Tensor]:
+    def collect_features(
+        self, trace: Trace, batch: Batch, margin: Tensor | None = None
+    ) -> dict[str, Tensor]:
         """Return what speaks for each estimate, with what such a network sees of it."""
-        features = super().collect_features(trace, batch)
+        features = super().collect_features(trace, batch, margin)
         if self._coordinate_net is None:
             return features
         return features | measure_coordinates(*self._see_estimate(trace, batch))

@@ -51,7 +51,11 @@ def measure_objectness(objectness: Tensor, batch: Batch, pose: Tensor, points: T
 
 
 def measure_presence(
-    method: PoseEstimator, trace: Trace, batch: Batch, objectness: float
+    method: PoseEstimator,
+    trace: Trace,
+    batch: Batch,
+    objectness: float,
+    margin: Tensor | None = None,
 ) -> tuple[float, Assessment | None]:
     """Return how probable it is that the object is where an estimate puts it.
 
@@ -65,11 +69,12 @@ def measure_presence(
         trace: The estimate, with the encoded image.
         batch: The image.
         objectness: As returned by `measure_objectness`.
+        margin: (1,) `texture_margin` of an earlier frame, which is then not measured.
 
     Returns:
         The presence in [0, 1], and the calibrated probabilities where there are any.
     """
-    found = method.assess(trace, batch)
+    found = method.assess(trace, batch, margin)
     if found is not None:
         return float(found.presence), found
     free_space = measure_depth(trace.belief.best, batch, method.object_model)["free_space"]

@@ -93,6 +93,7 @@ class TrackSnapshot(NamedTuple):
     loss_detector: TrackLossDetector
     frames: int
     apparent_size: ApparentSize | None
+    texture_margin: Tensor | None
 
 
 class FrameEstimate(NamedTuple):
@@ -153,19 +154,20 @@ class Track:
         self.loss_detector = TrackLossDetector(self.settings)
         self.frames = 0
         self.apparent_size: ApparentSize | None = None  # as last measured
+        self.texture_margin: Tensor | None = None  # likewise, (1,)
 
     @property
     def snapshot(self) -> TrackSnapshot:
         """What the next frame depends on."""
         random = self.generator.get_state()
-        return TrackSnapshot(
-            random, self.state, self.loss_detector, self.frames, self.apparent_size
-        )
+        own = (self.state, self.loss_detector, self.frames, self.apparent_size, self.texture_margin)
+        return TrackSnapshot(random, *own)
 
     @snapshot.setter
     def snapshot(self, snapshot: TrackSnapshot) -> None:
         self.generator.set_state(snapshot.random)
-        self.state, self.loss_detector, self.frames, self.apparent_size = snapshot[1:]
+        _, self.state, self.loss_detector, self.frames, *_ = snapshot
+        self.apparent_size, self.texture_margin = snapshot.apparent_size, snapshot.texture_margin
 
     @property
     def estimated_cost(self) -> float:
@@ -196,6 +198,8 @@ class Track:
             sight = self._follow(batch, predicted, windowed=window is not None)
         trusted, status = self.loss_detector.judge(sight.presence)
         self.apparent_size = self.apparent_size if sight.size is None else sight.size
+        if sight.found is not None and sight.found.features is not None:
+            self.texture_margin = sight.found.features.get("texture_margin")
         if status != LOST and sight.belief is not None:
             # inputs that are wrong stay so in frames that do not measure it
             sight = sight._replace(size=self.apparent_size)
@@ -389,6 +393,13 @@ class Track:
         # not in the frames that see the whole image, which cost more anyway
         return every > 0 and (self.frames + self.phase) % every == every // 4
 
+    @property
+    def _margin_is_due(self) -> bool:
+        """Whether the texture's margin is measured, which costs up to half of a frame's time."""
+        every = self.settings.texture_every or self.settings.whole_image_every
+        due = every == 0 or (self.frames + self.phase) % every == every // 4
+        return due or self.loss_detector.lost
+
     def _choose_window(self, images: Images, predicted: State) -> Window | None:
         """Return the window about the object; None where it is time for the whole image."""
         settings = self.settings
@@ -411,7 +422,8 @@ class Track:
         """Return what a frame shows, and whether the object is where the estimate puts it."""
         belief, points = trace.belief, self.method.object_model.points
         objectness = measure_objectness(trace.encoding.objectness, batch, belief.best[0], points)
-        presence, found = measure_presence(self.method, trace, batch, objectness)
+        margin = None if self._margin_is_due else self.texture_margin
+        presence, found = measure_presence(self.method, trace, batch, objectness, margin)
         return FrameEstimate(batch, belief, objectness, presence, found)
 
     def _describe(self, sight: FrameEstimate, blank: str, measured: bool) -> Run:

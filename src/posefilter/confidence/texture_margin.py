@@ -1,0 +1,97 @@
+"""By how much the texture fits the estimate better than any other rotation that its shape allows.
+
+The measured depth of a can looks the same at every rotation about its axis, and that of a box at
+several. There the texture decides, and how clearly it decides says how likely the rotation is
+right.
+"""
+
+from collections.abc import MutableMapping
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+from torch.utils.weak import WeakIdKeyDictionary
+
+from posefilter.filters.texture import (
+    coarsen_texture,
+    list_rotations,
+    measure_texture,
+    rotation_angles,
+)
+from posefilter.geometry.pose import transform
+from posefilter.geometry.pose_error import subsample
+from posefilter.protocols import HasColor
+from posefilter.types import ObjectModel
+
+_FAR = 0.1  # [diameters] by which a rotation moves the surface, from which on a pose is wrong
+_POINTS = 200  # of the surface, which are moved
+_FEW = 12  # rotations that are all compared with shifts of the image
+_BEST = 4  # others are, of more: the best, each with
+_BESIDE = 5  # those nearest to it, itself among them
+
+
+class Rivals(NamedTuple):
+    """The rotations that a shape allows and that would make a right pose wrong."""
+
+    turns: Tensor  # (R, 4, 4) object_from_object
+    # indices of some of them, no two of which are nearer than ten degrees
+    first: Tensor
+    symmetries: Tensor  # of the object, under which a pose stays right
+
+
+# of objects' shapes, as long as those are there
+_KNOWN: MutableMapping[Tensor, Rivals] = WeakIdKeyDictionary()
+
+
+def list_rivals(object_model: ObjectModel) -> Rivals:
+    """Return the rivals of a right pose of a textured object; empty where there are none."""
+    shape = object_model.shape_symmetries
+    known = None if shape is None else _KNOWN.get(shape)
+    if known is None or known.symmetries is not object_model.symmetries:
+        known = _list_rivals(object_model)
+        if shape is not None:
+            _KNOWN[shape] = known
+    return known
+
+
+def _list_rivals(object_model: ObjectModel) -> Rivals:
+    turns, first = list_rotations(object_model)
+    points = subsample(object_model.points, _POINTS).to(turns)
+    moved = transform(turns, points.expand(len(turns), -1, -1))
+    same = transform(object_model.symmetries.to(turns), points[None])
+    apart = torch.stack([(moved - one).norm(dim=-1).mean(-1) for one in same]).amin(0)
+    far = apart > _FAR * object_model.diameter
+    number = far.cumsum(0) - 1
+    return Rivals(turns[far], number[first[far[first]]], object_model.symmetries)
+
+
+def measure_texture_margin(
+    best: Tensor, image: HasColor, object_model: ObjectModel, evidence: Tensor
+) -> Tensor | None:
+    """Return how far the evidence of the texture at estimates is above that at other rotations.
+
+    Args:
+        best: (B, 4, 4) camera_from_object [m].
+        image: B images with color and depth.
+        object_model: The object, with a texture.
+        evidence: (B,) of the texture at the estimates (`measure_texture`) [nat].
+
+    Returns:
+        (B,) with m the difference to the best of the other rotations [nat], the logarithm of
+        1 + |m| with the sign of m; None where the shape allows no other.
+    """
+    rivals = list_rivals(object_model)
+    turns, first = rivals.turns.to(best), rivals.first.to(best.device)
+    if len(turns) == 0:
+        return None
+    near, coarse = first.expand(len(best), -1), coarsen_texture(object_model)
+    if len(first) > _FEW:
+        rough = measure_texture(best[:, None] @ turns[first], image, coarse, shift=0)
+        top = near.gather(1, rough.topk(_BEST, dim=1).indices)
+        most = min(_BESIDE, len(turns))
+        beside = rotation_angles(turns, turns).topk(most, dim=1, largest=False).indices
+        near = beside[top].flatten(1)
+    poses = best[:, None] @ turns[near]
+    other = measure_texture(poses, image, coarse).amax(1)
+    margin = evidence - other
+    return margin.sign() * margin.abs().log1p()
