@@ -210,15 +210,15 @@ def test_a_depth_that_is_a_fourth_too_large_is_measured_and_not_believed(
 
 @pytest.mark.slow
 def test_an_image_of_one_color_or_depth_is_doubted(estimator: posefilter.Estimator) -> None:
-    """A black one is answered from the depth alone, with a probability that nothing supports; in
-    one of one depth nothing of the box is left, and yet it is not absent.
+    """A black one is answered from the depth alone, with a presence that nothing supports; in one
+    of one depth nothing of the box is left, and yet it is not absent.
     """
     rgb, depth, K = read_scene(0, ONE_MODE)
     images = np.stack([rgb, 0 * rgb, rgb[:, ::-1]])  # of one depth: with its print mirrored
     depths = np.stack([depth, depth, 0 * depth + 0.7])
     plain, black, flat = estimator.predict(images, depths, K)
     assert (plain.verdict, plain.blank, plain.warnings) == ("found", "", ())
-    assert black.probability > 0.5
+    assert black.presence > 0.5
     assert flat.presence < 0.2
     for result, cause in ((black, "covered lens"), (flat, "right file")):
         assert result.verdict == "unsure"
