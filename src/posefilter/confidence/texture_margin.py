@@ -43,15 +43,15 @@ class Rivals(NamedTuple):
 _KNOWN: MutableMapping[Tensor, Rivals] = WeakIdKeyDictionary()
 
 
-def list_rivals(object_model: ObjectModel) -> Rivals:
-    """Return the rivals of a right pose of a textured object; empty where there are none."""
+def list_rivals(object_model: ObjectModel) -> Rivals | None:
+    """Return the rivals of a right pose of a textured object; None where there are none."""
     shape = object_model.shape_symmetries
-    known = None if shape is None else _KNOWN.get(shape)
+    if shape is None:  # a checkpoint of an earlier version
+        return None
+    known = _KNOWN.get(shape)
     if known is None or known.symmetries is not object_model.symmetries:
-        known = _list_rivals(object_model)
-        if shape is not None:
-            _KNOWN[shape] = known
-    return known
+        known = _KNOWN[shape] = _list_rivals(object_model)
+    return known if len(known.turns) else None
 
 
 def _list_rivals(object_model: ObjectModel) -> Rivals:
@@ -81,9 +81,9 @@ def measure_texture_margin(
         1 + |m| with the sign of m; None where the shape allows no other.
     """
     rivals = list_rivals(object_model)
-    turns, first = rivals.turns.to(best), rivals.first.to(best.device)
-    if len(turns) == 0:
+    if rivals is None:
         return None
+    turns, first = rivals.turns.to(best), rivals.first.to(best.device)
     near, coarse = first.expand(len(best), -1), coarsen_texture(object_model)
     if len(first) > _FEW:
         rough = measure_texture(best[:, None] @ turns[first], image, coarse, shift=0)
