@@ -36,6 +36,7 @@ class Rivals(NamedTuple):
     turns: Tensor  # (R, 4, 4) object_from_object
     # indices of some of them, no two of which are nearer than ten degrees
     first: Tensor
+    beside: Tensor  # (R, _BESIDE) indices of those nearest to each, itself first; fewer if R is
     symmetries: Tensor  # of the object, under which a pose stays right
 
 
@@ -61,8 +62,10 @@ def _list_rivals(object_model: ObjectModel) -> Rivals:
     same = transform(object_model.symmetries.to(turns), points[None])
     apart = torch.stack([(moved - one).norm(dim=-1).mean(-1) for one in same]).amin(0)
     far = apart > _FAR * object_model.diameter
-    number = far.cumsum(0) - 1
-    return Rivals(turns[far], number[first[far[first]]], object_model.symmetries)
+    turns, number = turns[far], far.cumsum(0) - 1
+    most = min(_BESIDE, len(turns))
+    beside = rotation_angles(turns, turns).topk(most, dim=1, largest=False).indices
+    return Rivals(turns, number[first[far[first]]], beside, object_model.symmetries)
 
 
 def measure_texture_margin(
@@ -88,9 +91,7 @@ def measure_texture_margin(
     if len(first) > _FEW:
         rough = measure_texture(best[:, None] @ turns[first], image, coarse, shift=0)
         top = near.gather(1, rough.topk(_BEST, dim=1).indices)
-        most = min(_BESIDE, len(turns))
-        beside = rotation_angles(turns, turns).topk(most, dim=1, largest=False).indices
-        near = beside[top].flatten(1)
+        near = rivals.beside.to(best.device)[top].flatten(1)
     poses = best[:, None] @ turns[near]
     other = measure_texture(poses, image, coarse).amax(1)
     margin = evidence - other

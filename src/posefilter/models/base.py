@@ -277,7 +277,7 @@ class PoseEstimator(Module):
         """
         if self.calibration is None:
             return None
-        known = () if margin is None else (margin,)
+        known = () if margin is None else (margin,)  # a method of one's own may take none
         features = self.collect_features(trace, batch, *known)
         return self.calibration.assess(features, self.pose_tolerance)
 
