@@ -199,7 +199,7 @@ def test_the_choice_ranks_answers_by_what_makes_them_right() -> None:
 
 def test_answers_are_not_compared_by_how_clearly_the_texture_decides() -> None:
     frames = draw(2000)
-    named = frames._replace(features=("texture_margin", "b", "texture_density"))
+    named = frames._replace(features=("rotation_margin", "b", "texture_density"))
     first = fit_choice(named, "scenes")
     assert first.choice is not None
     assert [weight > 0 for weight in first.choice.weights] == [False, True, False]

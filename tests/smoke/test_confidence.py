@@ -350,7 +350,7 @@ def test_methods_in_image_space_are_calibrated_too(
     assert run_command("calibrate", HOME, words) == 0
     stored = torch.load(out, weights_only=True)["calibration"]
     known = {"score", "concentration", "surface", "free_space", "texture"}
-    known |= {"texture_density", "texture_margin"}  # of the carton, whose shape allows rotations
+    known |= {"texture_density", "rotation_margin"}  # of the carton, whose shape allows rotations
     assert set(stored["features"]) == known
     rgb = min(tiny_scenes.rglob("*.left.jpg"))
     depth = rgb.with_name(rgb.name.replace(".left.jpg", ".left.depth.png"))

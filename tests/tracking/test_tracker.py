@@ -537,7 +537,7 @@ def test_the_textures_margin_is_measured_now_and_then_and_kept(
 ) -> None:
     toy, estimator = make_toy()
     toy.calibration = Calibration(
-        ("score", "texture_margin"), (-5.0, 4.5), (2.0, 9.0), Logistic((3.0, 0.0), 0.0),
+        ("score", "rotation_margin"), (-5.0, 4.5), (2.0, 9.0), Logistic((3.0, 0.0), 0.0),
         Logistic((0.0, 4.0), 0.0), {"right": 20, "wrong": 0, "absent": 20}, "toy", {},
     )  # fmt: skip
     collect, measured, now = toy.collect_features, [], [0]
@@ -546,7 +546,7 @@ def test_the_textures_margin_is_measured_now_and_then_and_kept(
         if margin is None:
             measured.append(now[0])
             margin = torch.full((1,), float(now[0]))
-        return collect(trace, batch) | {"texture_margin": margin}
+        return collect(trace, batch) | {"rotation_margin": margin}
 
     monkeypatch.setattr(toy, "collect_features", collect_with_margin)
     settings = TrackerSettings(texture_every=every, whole_image_every=4)

@@ -160,6 +160,11 @@ class Calibration:
             raise UserError("calibration: compares no answers; calibrate the checkpoint again")
         return _evaluate(self.choice, self.standardize(values))
 
+    def choice_ignores(self, feature: str) -> bool:
+        """Return whether a feature has no part in what answers to one image are compared by."""
+        weights = () if self.choice is None else self.choice.weights
+        return not dict(zip(self.features, weights, strict=False)).get(feature, True)
+
     def standardize(self, values: Mapping[str, Tensor]) -> Tensor:
         """Return features (B,) by name as the regressions take them, (B, F) float64."""
         return self._standardize(self._stack(values))

@@ -6,12 +6,13 @@ surface where the pose says, and does the proposal network, which has seen the i
 take the same pixels for the same points of the object?
 """
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from posefilter.confidence.texture_margin import measure_texture_margin
+from posefilter.confidence.rotation_margin import measure_rotation_margin
 from posefilter.filters.texture import coarsen_texture, measure_texture
 from posefilter.geometry.camera import project
 from posefilter.geometry.lookup import gather_pixels, nearest_pixel
@@ -88,6 +89,7 @@ def measure_print(
     object_model: ObjectModel,
     surface: Tensor,
     margin: Tensor | None = None,
+    score: Callable[[Tensor], Tensor] | None = None,
 ) -> dict[str, Tensor]:
     """Return whether the image shows the object's print where poses put it.
 
@@ -96,13 +98,15 @@ def measure_print(
         batch: B images.
         object_model: The object.
         surface: (B,) as of `measure_depth`.
-        margin: (B,) `texture_margin` of earlier images, which is then not measured.
+        margin: (B,) `rotation_margin` of earlier images, which is then not measured.
+        score: Returns the learned log-likelihoods (B, N) of poses (B, N, 4, 4), if there is one.
 
     Returns:
         (B,) each; nothing where the object has no texture. `texture`: the logarithm of one plus the
         evidence of the print [nat]. `texture_density`: the same less the logarithm of `surface`,
-        since more of a surface that is seen should show more of its print. `texture_margin`: how
-        far the evidence is above that of other rotations; absent where the shape allows none.
+        since more of a surface that is seen should show more of its print. `rotation_margin`: how
+        far the estimate's log-posterior is above that of other rotations; absent where the shape
+        allows none.
     """
     if object_model.texture is None:
         return {}
@@ -111,8 +115,8 @@ def measure_print(
     out = {"texture": evidence.log1p()}
     out["texture_density"] = out["texture"] - (surface + _FEW / _POINTS).log()
     if margin is None:
-        margin = measure_texture_margin(best, image, object_model, evidence)
-    return out if margin is None else {**out, "texture_margin": margin}
+        margin = measure_rotation_margin(best, image, object_model, evidence, score)
+    return out if margin is None else {**out, "rotation_margin": margin}
 
 
 def measure_coordinates(

@@ -18,7 +18,7 @@ _FOLDS = 5  # of cross-validation
 FEWEST = 10  # frames with the object, and without
 # features that answers to one image are not compared by: they say how sure an answer is, and
 # whether they choose a better one was not tried
-_NOT_COMPARED = ("texture_density", "texture_margin")
+_NOT_COMPARED = ("texture_density", "rotation_margin")
 
 
 class Frames(NamedTuple):

@@ -66,7 +66,7 @@ def look_again(method: Any, first: Trace, batch: Batch, generator: Generator) ->
     calibration, searches = method.calibration, method.filter.max_searches
     if calibration is None or calibration.choice is None or searches < 2:
         return first
-    ranks = calibration.rank(method.collect_features(first, batch))
+    ranks = _rank(method, calibration, first, batch)
     contradicted = _contradicts(method, first, batch).to(ranks.device)
     trace = first
     for row in ((ranks < DOUBTFUL) | contradicted).nonzero()[:, 0].tolist():
@@ -78,6 +78,15 @@ def look_again(method: Any, first: Trace, batch: Batch, generator: Generator) ->
         if found is not None:
             trace = _put(trace, row, found)
     return trace
+
+
+def _rank(method: Any, calibration: Calibration, trace: Trace, batch: Batch) -> Tensor:
+    """Return what answers are compared by, (B,).  A margin of rotations that has no part in it, and
+    costs time, is not measured.
+    """
+    ignored = calibration.choice_ignores("rotation_margin")
+    known = (trace.belief.score.new_zeros(len(batch.rgb)),) if ignored else ()
+    return calibration.rank(method.collect_features(trace, batch, *known))
 
 
 def _contradicts(method: Any, trace: Trace, batch: Batch) -> Tensor:
@@ -120,7 +129,7 @@ def _search(
         found = method.search(part, generator, encoding)
         # what was hidden is there: judged by the whole image, as the first answer
         found = found._replace(encoding=whole)
-        value = float(calibration.rank(method.collect_features(found, image))[0])
+        value = float(_rank(method, calibration, found, image)[0])
         if value > min_rank and not _contradicts(method, found, image).any():
             min_rank, best = value, found
             if value >= DOUBTFUL:

@@ -37,6 +37,8 @@ _SHIFT = 0.002  # [focal lengths], a pixel of the width at which networks see
 _MOST = 12  # turns that are compared with shifts
 _BESIDE = 5  # turns beside one that is tried first, and itself
 _APART = 10.0  # [degrees] between the turns that are tried first
+LEARNED_PIXELS = 256  # image points of a learned score that is added to the evidence
+LEARNED_SIGMA = 0.004  # [m] its noise level
 _MISSING = (
     "filter/refine: the checkpoint carries no texture of '{name}', as those of earlier versions; "
     "choose filter/refine=mean_shift_icp, or train again"
@@ -294,7 +296,10 @@ class TextureRotations:
     requires: ClassVar[Capabilities] = ("color", "depth", "pose")
 
     def __init__(
-        self, learned_weight: float = 1.0, pixels: int = 256, sigma: float = 0.004
+        self,
+        learned_weight: float = 1.0,
+        pixels: int = LEARNED_PIXELS,
+        sigma: float = LEARNED_SIGMA,
     ) -> None:
         if learned_weight < 0 or min(pixels, sigma) <= 0:
             raise UserError(

@@ -29,6 +29,7 @@ from posefilter.confidence.verdicts import Costs
 from posefilter.data.absent import hide_annotation
 from posefilter.errors import UserError
 from posefilter.filters.loop import ParticleFilter
+from posefilter.filters.texture import LEARNED_PIXELS, LEARNED_SIGMA
 from posefilter.geometry.camera import project
 from posefilter.geometry.pose import origin_of
 from posefilter.geometry.spaces import PoseSpace
@@ -39,7 +40,7 @@ from posefilter.models.clipping import SubmoduleClipper
 from posefilter.models.lr_schedulers import find_length, start_schedule
 from posefilter.models.quantization import unpack_object
 from posefilter.models.zoom import check_zoom, choose_part, search
-from posefilter.protocols import Loss, Space
+from posefilter.protocols import Loss, ScoresPoses, Space
 from posefilter.types import Batch, BeliefBatch, ObjectModel, ParticleOutput, Particles, Step, Trace
 
 if TYPE_CHECKING:
@@ -223,7 +224,7 @@ class PoseEstimator(Module):
         Args:
             trace: A finished run of the filter, or its last step alone.
             batch: Its B images; mask and pose are not used.
-            margin: (B,) `texture_margin` of earlier images of a track, which is then not measured.
+            margin: (B,) `rotation_margin` of earlier images of a track, which is then not measured.
 
         Returns:
             (B,) each; more of it speaks for the estimate.
@@ -233,8 +234,22 @@ class PoseEstimator(Module):
         return {
             **measure_belief(trace.belief, object_model),
             **depth,
-            **measure_print(best, batch, object_model, depth["surface"], margin),
+            **measure_print(
+                best, batch, object_model, depth["surface"], margin, self._scorer(trace, batch)
+            ),
         }
+
+    def _scorer(self, trace: Trace, batch: Batch) -> Callable[[Tensor], Tensor] | None:
+        """Return a function from poses to their learned log-likelihoods, as `TextureRotations` adds
+        them; None where the method scores no poses.
+        """
+        if not isinstance(self, ScoresPoses):
+            return None
+        encoding = self.encode(batch) if trace.encoding is None else trace.encoding
+        # the same image points each time: an estimate is as probable as before
+        generator = torch.Generator(device=self.device).manual_seed(self.seed)
+        own = (LEARNED_SIGMA, generator, LEARNED_PIXELS)
+        return lambda poses: self.score_poses(encoding, poses, *own)
 
     def measure_apparent_size(self, trace: Trace, batch: Batch) -> ApparentSize | None:
         """Return how large the object appears, relative to its mesh; None where the method cannot

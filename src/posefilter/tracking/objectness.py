@@ -69,7 +69,7 @@ def measure_presence(
         trace: The estimate, with the encoded image.
         batch: The image.
         objectness: As returned by `measure_objectness`.
-        margin: (1,) `texture_margin` of an earlier frame, which is then not measured.
+        margin: (1,) `rotation_margin` of an earlier frame, which is then not measured.
 
     Returns:
         The presence in [0, 1], and the calibrated probabilities where there are any.

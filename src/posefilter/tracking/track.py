@@ -93,7 +93,7 @@ class TrackSnapshot(NamedTuple):
     loss_detector: TrackLossDetector
     frames: int
     apparent_size: ApparentSize | None
-    texture_margin: Tensor | None
+    rotation_margin: Tensor | None
 
 
 class FrameEstimate(NamedTuple):
@@ -154,20 +154,26 @@ class Track:
         self.loss_detector = TrackLossDetector(self.settings)
         self.frames = 0
         self.apparent_size: ApparentSize | None = None  # as last measured
-        self.texture_margin: Tensor | None = None  # likewise, (1,)
+        self.rotation_margin: Tensor | None = None  # likewise, (1,)
 
     @property
     def snapshot(self) -> TrackSnapshot:
         """What the next frame depends on."""
         random = self.generator.get_state()
-        own = (self.state, self.loss_detector, self.frames, self.apparent_size, self.texture_margin)
+        own = (
+            self.state,
+            self.loss_detector,
+            self.frames,
+            self.apparent_size,
+            self.rotation_margin,
+        )
         return TrackSnapshot(random, *own)
 
     @snapshot.setter
     def snapshot(self, snapshot: TrackSnapshot) -> None:
         self.generator.set_state(snapshot.random)
         _, self.state, self.loss_detector, self.frames, *_ = snapshot
-        self.apparent_size, self.texture_margin = snapshot.apparent_size, snapshot.texture_margin
+        self.apparent_size, self.rotation_margin = snapshot.apparent_size, snapshot.rotation_margin
 
     @property
     def estimated_cost(self) -> float:
@@ -199,7 +205,7 @@ class Track:
         trusted, status = self.loss_detector.judge(sight.presence)
         self.apparent_size = self.apparent_size if sight.size is None else sight.size
         if sight.found is not None and sight.found.features is not None:
-            self.texture_margin = sight.found.features.get("texture_margin")
+            self.rotation_margin = sight.found.features.get("rotation_margin")
         if status != LOST and sight.belief is not None:
             # inputs that are wrong stay so in frames that do not measure it
             sight = sight._replace(size=self.apparent_size)
@@ -422,7 +428,7 @@ class Track:
         """Return what a frame shows, and whether the object is where the estimate puts it."""
         belief, points = trace.belief, self.method.object_model.points
         objectness = measure_objectness(trace.encoding.objectness, batch, belief.best[0], points)
-        margin = None if self._margin_is_due else self.texture_margin
+        margin = None if self._margin_is_due else self.rotation_margin
         presence, found = measure_presence(self.method, trace, batch, objectness, margin)
         return FrameEstimate(batch, belief, objectness, presence, found)
 

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from posefilter.confidence.features import measure_print
-from posefilter.confidence.texture_margin import Rivals, list_rivals, measure_texture_margin
+from posefilter.confidence.rotation_margin import Rivals, list_rivals, measure_rotation_margin
 from posefilter.filters.texture import coarsen_texture, measure_texture
 from posefilter.geometry.pose import make_pose, transform
 from posefilter.geometry.rotation import random_rotation
@@ -29,7 +29,7 @@ def rivals_of(model: ObjectModel) -> Rivals:
 
 def margin(pose: Tensor, image: Seen, model: ObjectModel) -> float:
     evidence = measure_texture(pose[None, None], image, coarsen_texture(model))[:, 0]
-    found = measure_texture_margin(pose[None], image, model, evidence)
+    found = measure_rotation_margin(pose[None], image, model, evidence)
     assert found is not None
     return float(found)
 
@@ -62,7 +62,7 @@ def test_of_a_can_a_search_of_some_rotations_finds_the_best_of_all() -> None:
     image, turns = look("soup_can", pose), rivals_of(model).turns
     every = measure_texture(pose @ turns[None], image, coarsen_texture(model))[0].max()
     zero = torch.zeros(1)
-    found = measure_texture_margin(pose[None], image, model, zero)
+    found = measure_rotation_margin(pose[None], image, model, zero)
     assert found is not None
     assert float(every) > 1
     assert float((-found).expm1()) > 0.8 * float(every)
@@ -78,9 +78,9 @@ def test_rivals_make_a_right_pose_wrong_and_rotations_that_change_nothing_are_no
     same = model._replace(symmetries=model.shape_symmetries)
     assert list_rivals(same) is None
     image = look("soup_can", pose := place(model))
-    assert measure_texture_margin(pose[None], image, same, torch.ones(1)) is None
+    assert measure_rotation_margin(pose[None], image, same, torch.ones(1)) is None
     old = model._replace(shape_symmetries=None)  # as earlier versions wrote it
-    assert measure_texture_margin(pose[None], image, old, torch.ones(1)) is None
+    assert measure_rotation_margin(pose[None], image, old, torch.ones(1)) is None
 
 
 def test_a_print_is_dense_where_little_surface_shows_it_and_a_known_margin_is_kept() -> None:
@@ -104,8 +104,8 @@ def test_a_print_is_dense_where_little_surface_shows_it_and_a_known_margin_is_ke
     assert torch.equal(much["texture"], little["texture"])
     gained = float(little["texture_density"] - much["texture_density"])
     assert gained == pytest.approx(math.log(4), abs=1e-5)
-    assert float(much["texture_margin"]) == pytest.approx(margin(pose, image, model), abs=1e-5)
+    assert float(much["rotation_margin"]) == pytest.approx(margin(pose, image, model), abs=1e-5)
     known = measure_print(pose[None], seen, model, torch.tensor([0.1]), torch.tensor([-3.0]))
-    assert float(known["texture_margin"]) == -3
+    assert float(known["rotation_margin"]) == -3
     plain = measure_print(pose[None], seen, model._replace(texture=None), torch.tensor([0.1]))
     assert plain == {}

@@ -1,11 +1,11 @@
-"""By how much the texture fits the estimate better than any other rotation that its shape allows.
+"""By how much an estimate fits the image better than any other rotation that its shape allows.
 
 The measured depth of a can looks the same at every rotation about its axis, and that of a box at
-several. There the texture decides, and how clearly it decides says how likely the rotation is
-right.
+several. There texture and learned likelihood decide (`TextureRotations`), and how clearly they
+decide says how likely the rotation is right.
 """
 
-from collections.abc import MutableMapping
+from collections.abc import Callable, MutableMapping
 from typing import NamedTuple
 
 import torch
@@ -68,16 +68,24 @@ def _list_rivals(object_model: ObjectModel) -> Rivals:
     return Rivals(turns, number[first[far[first]]], beside, object_model.symmetries)
 
 
-def measure_texture_margin(
-    best: Tensor, image: HasColor, object_model: ObjectModel, evidence: Tensor
+def measure_rotation_margin(
+    best: Tensor,
+    image: HasColor,
+    object_model: ObjectModel,
+    evidence: Tensor,
+    score: Callable[[Tensor], Tensor] | None = None,
 ) -> Tensor | None:
-    """Return how far the evidence of the texture at estimates is above that at other rotations.
+    """Return how far the log-posterior at estimates is above that at other rotations.
+
+    It is the evidence of the texture, plus the learned log-likelihood where there is one. On
+    photographs the texture alone decides less clearly than on renders.
 
     Args:
         best: (B, 4, 4) camera_from_object [m].
         image: B images with color and depth.
         object_model: The object, with a texture.
         evidence: (B,) of the texture at the estimates (`measure_texture`) [nat].
+        score: Returns the learned log-likelihoods (B, N) of poses (B, N, 4, 4), if there is one.
 
     Returns:
         (B,) with m the difference to the best of the other rotations [nat], the logarithm of
@@ -88,11 +96,18 @@ def measure_texture_margin(
         return None
     turns, first = rivals.turns.to(best), rivals.first.to(best.device)
     near, coarse = first.expand(len(best), -1), coarsen_texture(object_model)
+    score = score or _score_alike
     if len(first) > _FEW:
-        rough = measure_texture(best[:, None] @ turns[first], image, coarse, shift=0)
+        poses = best[:, None] @ turns[first]
+        rough = measure_texture(poses, image, coarse, shift=0) + score(poses)
         top = near.gather(1, rough.topk(_BEST, dim=1).indices)
         near = rivals.beside.to(best.device)[top].flatten(1)
     poses = best[:, None] @ turns[near]
-    other = measure_texture(poses, image, coarse).amax(1)
-    margin = evidence - other
+    learned = score(torch.cat([best[:, None], poses], dim=1))
+    other = (measure_texture(poses, image, coarse) + learned[:, 1:]).amax(1)
+    margin = evidence + learned[:, 0] - other
     return margin.sign() * margin.abs().log1p()
+
+
+def _score_alike(poses: Tensor) -> Tensor:
+    return torch.zeros_like(poses[..., 0, 0])
