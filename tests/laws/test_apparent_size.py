@@ -102,3 +102,14 @@ def test_a_batch_is_its_images() -> None:
     for i, one in enumerate((large, plain)):
         alone = measure(one)
         assert [float(x[i]) for x in together] == pytest.approx([float(x[0]) for x in alone])
+
+
+def test_an_estimate_is_measured_once_by_each_output_of_a_network() -> None:
+    pose, seen, other = POSE.clone(), look(torch.ones(3)), look(torch.full((3,), 1.25))
+    first = measure_apparent_size(pose, *seen, MODEL)
+    assert measure_apparent_size(pose, *seen, MODEL) is first
+    changed = measure_apparent_size(pose, *other, MODEL)
+    assert float(changed.scale) != float(first.scale)
+    again = measure_apparent_size(POSE.clone(), *seen, MODEL)
+    assert again is not first
+    assert torch.equal(again.scale, first.scale)

@@ -1,6 +1,7 @@
 """The texture's margin says how clearly the image decides between rotations of a shape."""
 
 import math
+from collections.abc import Callable
 
 import pytest
 import torch
@@ -109,3 +110,27 @@ def test_a_print_is_dense_where_little_surface_shows_it_and_a_known_margin_is_ke
     assert float(known["rotation_margin"]) == -3
     plain = measure_print(pose[None], seen, model._replace(texture=None), torch.tensor([0.1]))
     assert plain == {}
+
+
+@pytest.mark.parametrize("name", ["carton", "soup_can"])
+def test_the_learned_likelihood_counts_as_much_as_the_texture(name: str) -> None:
+    model, by = load(name), 1000.0
+    pose, rivals = place(model), rivals_of(model)
+    image = look(name, pose)
+    evidence = measure_texture(pose[None, None], image, coarsen_texture(model))[:, 0]
+
+    def measure(score: Callable[[Tensor], Tensor]) -> float:
+        found = measure_rotation_margin(pose[None], image, model, evidence, score)
+        assert found is not None
+        return float(found)
+
+    def favor(one: Tensor) -> Callable[[Tensor], Tensor]:
+        return lambda poses: by * ((poses - one).flatten(-2).norm(dim=-1) < 1e-4)
+
+    alone = margin(pose, image, model)
+    same = measure(lambda poses: poses.new_full(poses.shape[:2], 7.0))
+    assert same == pytest.approx(alone, abs=1e-4)
+    other = pose @ rivals.turns[rivals.first[len(rivals.first) // 2]]
+    assert -math.log1p(by) < measure(favor(other)) < -math.log1p(by / 2)
+    more = math.log1p(math.expm1(alone) + by)
+    assert measure(favor(pose)) == pytest.approx(more, rel=1e-3)

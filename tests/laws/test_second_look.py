@@ -271,6 +271,33 @@ def test_an_answer_of_another_size_replaces_none() -> None:
     assert places(last) == [(40, 30)]
 
 
+@pytest.mark.parametrize(("weight", "measured"), [(0.0, False), (1.0, True)])
+def test_a_margin_of_rotations_that_answers_are_not_compared_by_is_not_measured(
+    weight: float, measured: bool
+) -> None:
+    asked = []
+
+    class WithMargin(Toy):
+        def collect_features(
+            self, trace: Trace, batch: Batch, margin: Tensor | None = None
+        ) -> dict[str, Tensor]:
+            asked.append(margin is None)
+            green = super().collect_features(trace, batch)["green"]
+            return {"green": green, "rotation_margin": green if margin is None else margin}
+
+    calibration = replace(
+        CALIBRATION,
+        features=("green", "rotation_margin"),
+        center=(0.5, 0.5),
+        scale=(0.25, 0.25),
+        choice=Logistic((5.0, weight), 0.0),
+    )
+    _, last = run(WithMargin(calibration=calibration), draw([[WRONG, RIGHT]]))
+    assert places(last) == [RIGHT[:2]]
+    assert len(asked) > 1
+    assert set(asked) == {measured}
+
+
 def test_a_method_whose_images_are_encoded_is_of_its_class() -> None:
     toy = Toy()
     known, batch = with_encoding(toy, "kept"), draw([[(9, 9, 1.0, 1.0)]])

@@ -8,10 +8,13 @@ transform, whose scale is 1 where the inputs are right.
 """
 
 import math
+import weakref
+from collections.abc import MutableMapping
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
+from torch.utils.weak import WeakIdKeyDictionary
 
 from posefilter.geometry.pose import origin_of, rotation_of
 from posefilter.nets.coordinates import Cells, Coordinates
@@ -41,6 +44,11 @@ class ApparentSize(NamedTuple):
         return off & (self.gain > _LEAST_GAIN) & (self.explained > _EXPLAINED)
 
 
+# of estimates, as long as those are there: the output of the network that it was measured by, and
+# the size, which is asked for when an answer is chosen and again for the result
+_KNOWN: MutableMapping[Tensor, tuple[weakref.ref[Tensor], ApparentSize]] = WeakIdKeyDictionary()
+
+
 def measure_apparent_size(
     best: Tensor, coordinates: Coordinates, cells: Cells, object_model: ObjectModel
 ) -> ApparentSize:
@@ -56,10 +64,15 @@ def measure_apparent_size(
         cells: The measured point of each cell.
         object_model: The object.
     """
+    known = _KNOWN.get(best)
+    if known is not None and known[0]() is coordinates.logit:
+        return known[1]
     found = [
         _measure(best[i], _seen(coordinates, cells, i), object_model) for i in range(len(best))
     ]
-    return ApparentSize(*(torch.stack(part) for part in zip(*found, strict=True)))
+    size = ApparentSize(*(torch.stack(part) for part in zip(*found, strict=True)))
+    _KNOWN[best] = weakref.ref(coordinates.logit), size
+    return size
 
 
 class _Seen(NamedTuple):
