@@ -43,6 +43,7 @@ _MODE = 0.02  # [m] about the best particle, over which the estimate is a mean
 # by how much errors of a track are larger than those of the calibrated filter, whose estimate is
 # refined more: of five objects in rendered sequences
 _WIDENING = 1.3
+_TEXTURE_EVERY = 8  # frames, for the margin of the rotation where there are no turns by texture
 _ICP_STEPS = 2  # a tracked estimate starts close: more cost a tenth of a frame's time
 
 
@@ -244,7 +245,7 @@ class Track:
         self.method.seed = self.seed
         trace = self.method.predict_step(batch, 0)
         size = self.method.measure_apparent_size(trace, batch)
-        return self._weigh(batch, trace)._replace(size=size)
+        return self._weigh(batch, trace, with_margin=True)._replace(size=size)
 
     def _follow(self, batch: Batch, predicted: State, windowed: bool) -> FrameEstimate:
         """Run a filter of few particles from the predicted belief."""
@@ -264,7 +265,8 @@ class Track:
         encoding, start = self.method.encode(batch), predicted.belief.state
         turns = [RotateTogether(one) for one in self._texture_rotations if self._texture_is_due]
         refine = self._refine(settings.quadratic_fits, turns)
-        found, trace = self._filter(batch, encoding, start, follow, refine, against)
+        due = self._margin_is_due
+        found, trace = self._filter(batch, encoding, start, follow, refine, against, due)
         if not windowed and self._has_wrong_size:  # the inputs may be right now, or have been
             size = self.method.measure_apparent_size(trace, batch)
             if size is not None and bool(size.scale.isfinite().all()):
@@ -275,7 +277,9 @@ class Track:
         """Probe the whole image for a lost object, and search where that is worth it."""
         settings, encoding = self.settings, self.method.encode(batch)
         start = predicted.belief.state
-        probed, _ = self._filter(batch, encoding, start, settings.probe, self._refine(0))
+        probed, _ = self._filter(
+            batch, encoding, start, settings.probe, self._refine(0), with_margin=False
+        )
         if probed.presence < settings.search_above and not self._search_is_due:
             return probed
         assert probed.belief is not None
@@ -284,7 +288,7 @@ class Track:
         start = inherit(begun.state, drawn)
         # as in a single image: the frame before does not tell how the object is turned
         refine = self._refine(settings.quadratic_fits, self._texture_rotations)
-        found, trace = self._filter(batch, encoding, start, search, refine)
+        found, trace = self._filter(batch, encoding, start, search, refine, with_margin=True)
         return found._replace(size=self.method.measure_apparent_size(trace, batch))
 
     def _filter(
@@ -295,8 +299,11 @@ class Track:
         filter_settings: FilterSettings,
         refine: Refine,
         against: float = 0.0,
+        with_margin: bool = False,
     ) -> tuple[FrameEstimate, Trace]:
-        """Run a filter from poses (1, N, 4, 4), and proposals with log odds `against` them."""
+        """Run a filter from poses (1, N, 4, 4), and proposals with log odds `against` them; see
+        `_weigh`.
+        """
         particles = min(start.shape[1], 2 * filter_settings.min_particles)
         filter = ParticleFilter(
             particles=particles,  # after the first step
@@ -312,7 +319,7 @@ class Track:
         pixels, proposals = filter_settings.pixels, filter_settings.proposals
         scorer = FrameScorer(self.method, encoding, pixels, proposals, against)
         trace = filter(batch, scorer, self.generator)
-        return self._weigh(batch, trace), trace
+        return self._weigh(batch, trace, with_margin), trace
 
     def _refine(self, quadratic_fits: int, turns: Sequence[Refine] = ()) -> Refine:
         """Return what improves a frame's estimate: the likelihood, then the measured depth, then
@@ -401,10 +408,10 @@ class Track:
 
     @property
     def _margin_is_due(self) -> bool:
-        """Whether the texture's margin is measured, which costs up to half of a frame's time."""
-        every = self.settings.texture_every or self.settings.whole_image_every
-        due = every == 0 or (self.frames + self.phase) % every == every // 4
-        return due or self.loss_detector.lost
+        """Whether the rotation's margin is measured, which of a can costs as much as a frame."""
+        every = self.settings.texture_every or _TEXTURE_EVERY
+        # after every other turn by the texture
+        return (self.frames + self.phase) % (2 * every) == every // 4
 
     def _choose_window(self, images: Images, predicted: State) -> Window | None:
         """Return the window about the object; None where it is time for the whole image."""
@@ -424,11 +431,14 @@ class Track:
             settings.window_scale + more / self.space.radius,
         )
 
-    def _weigh(self, batch: Batch, trace: Trace) -> FrameEstimate:
-        """Return what a frame shows, and whether the object is where the estimate puts it."""
+    def _weigh(self, batch: Batch, trace: Trace, with_margin: bool) -> FrameEstimate:
+        """Return what a frame shows, and whether the object is where the estimate puts it.
+
+        The rotation's margin is measured with it, or is that of an earlier frame.
+        """
         belief, points = trace.belief, self.method.object_model.points
         objectness = measure_objectness(trace.encoding.objectness, batch, belief.best[0], points)
-        margin = None if self._margin_is_due else self.rotation_margin
+        margin = None if with_margin else self.rotation_margin
         presence, found = measure_presence(self.method, trace, batch, objectness, margin)
         return FrameEstimate(batch, belief, objectness, presence, found)
 
