@@ -1,11 +1,14 @@
 """Meshes written and read again, and what a look at a mesh tells."""
 
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from omegaconf import OmegaConf
 
+from posefilter.cli.onboarded_mesh import read_onboarded
 from posefilter.errors import UserError
 from posefilter.meshes.builtin import catalog
 from posefilter.meshes.files import read_mesh
@@ -51,6 +54,22 @@ def test_a_hole_and_a_lost_texture_are_reported(brick: Mesh) -> None:
     for mesh, word in ((halved, "not closed"), (plain, "one color")):
         (concern,) = list_concerns(inspect_mesh(mesh))
         assert word in concern
+
+
+@pytest.mark.parametrize(
+    ("scale", "helps"), [(1e5, False), (30, True), (0.05, True), (1e-3, False)]
+)
+def test_a_unit_of_meters_is_advised_where_it_is_taken(
+    scale: float, helps: bool, brick: Mesh, tmp_path: Path
+) -> None:
+    large = replace(brick, vertices=brick.vertices * scale)
+    with pytest.raises(UserError) as refused:
+        check_size(inspect_mesh(large), "drill.obj")
+    assert str(refused.value).endswith("give mesh_scale=1") == helps
+    file = str(write_obj(large, tmp_path / "drill"))
+    cfg = OmegaConf.create({"mesh": file, "name": None, "mesh_scale": 1})
+    with nullcontext() if helps else pytest.raises(UserError, match=r"mesh_scale=1: .* mm across"):
+        read_onboarded(cfg)
 
 
 @pytest.mark.parametrize(("scale", "advice"), [(1000, "0.001"), (100, "0.01")])

@@ -6,6 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from posefilter.errors import UserError
+from posefilter.meshes import store
 from posefilter.meshes.mesh import (
     OPEN_EDGES,
     Mesh,
@@ -80,7 +81,9 @@ def check_size(facts: MeshFacts, source: str) -> None:
         if SMALLEST <= across * scale <= LARGEST
     ]
     advice = f"is it {' or '.join(fitting)}?" if fitting else "is the file damaged?"
-    raise UserError(f"{source}: {across:.3g} m across; {advice} If it is right, give mesh_scale=1")
+    if store.SMALLEST <= across <= store.LARGEST:  # else that is refused, too
+        advice += " If it is right, give mesh_scale=1"
+    raise UserError(f"{source}: {across:.3g} m across; {advice}")
 
 
 def list_concerns(facts: MeshFacts) -> list[str]:
