@@ -108,3 +108,14 @@ def test_depth_given_as_color_is_told(tmp_path: Path) -> None:
     cv2.imwrite(str(path), np.ones((4, 4), np.uint16))
     with pytest.raises(BadData, match=r"not 8-bit \(found uint16; is it the depth\?"):
         read_color(path)
+
+
+@pytest.mark.parametrize("name", ["a.npy", "a.npz", "a.exr"])
+def test_color_that_is_no_image_is_not_advised_what_depth_is(name: str, tmp_path: Path) -> None:
+    path = tmp_path / name
+    if name == "a.exr":
+        path.write_bytes(b"v/1\x01\x02")
+    else:
+        (np.save if name == "a.npy" else np.savez)(path, np.zeros((4, 4, 3), np.uint8))
+    with pytest.raises(BadData, match=r"color is read of images alone.*\(save a PNG\)"):
+        read_color(path)

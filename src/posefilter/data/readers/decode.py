@@ -17,6 +17,7 @@ from posefilter.errors import BadData
 from posefilter.limits import check_picture, read_bytes
 
 _TURNS = range(2, 9)  # of EXIF; 1: none
+_DEPTH_ALONE = {b"\x93NUMPY": "an array", b"PK\x03\x04": "an archive", b"v/1\x01": "an EXR"}
 _PNG, _JPEG = b"\x89PNG\r\n\x1a\n", b"\xff\xd8"
 
 
@@ -25,6 +26,9 @@ def read_color(path: Path) -> np.ndarray:
     RGB.
     """
     data = read_bytes(path)
+    kind = next((what for head, what in _DEPTH_ALONE.items() if data.startswith(head)), None)
+    if kind is not None:
+        raise BadData(path, f"color is read of images alone, and this is {kind}", "save a PNG")
     image = decode_image(data, path)
     _check_upright(data, path)
     if image.dtype != np.uint8:
