@@ -54,6 +54,8 @@ def test_a_mesh_in_millimeters_is_refused_until_its_unit_is_given(tmp_path: Path
     np.testing.assert_allclose(mesh.bounds, brick.bounds, atol=1e-6)
     with pytest.raises(UserError, match=r"mesh=brik: no such file, and no builtin mesh \(banana"):
         read_onboarded(settings("brik"))
+    with pytest.raises(UserError, match=r"is a folder; name an \.obj, \.ply or \.glb file in it"):
+        read_onboarded(settings(tmp_path))
     with pytest.raises(UserError, match=r"name=\.\./up: letters"):
         read_onboarded(settings("brick", name="../up"))
 

@@ -49,6 +49,8 @@ def read_onboarded(cfg: DictConfig) -> Mesh:
             )
     elif source in catalog.names():
         mesh = replace(catalog.build(source), name=str(cfg.name or source))
+    elif Path(source).is_dir():
+        raise UserError(f"mesh={source}: is a folder; name an .obj, .ply or .glb file in it")
     else:
         known = ", ".join(catalog.names())
         raise UserError(f"mesh={source}: no such file, and no builtin mesh ({known})")
