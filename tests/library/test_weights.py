@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from posefilter.cli.checkpoints import find_checkpoint
 from posefilter.errors import UserError
 from posefilter.weights import (
     FOLDERS,
@@ -188,3 +189,8 @@ def test_a_list_a_pattern_and_all_stand_for_several(tmp_path: Path) -> None:
     for nothing in (f"{tmp_path}/*.pt", []):
         with pytest.raises(UserError, match="no weights there"):
             expand_weights(nothing)
+
+
+def test_a_folder_that_is_no_runs_is_told_as_one(tmp_path: Path) -> None:
+    with pytest.raises(UserError, match=r"is a folder without checkpoints/best\.ckpt"):
+        find_checkpoint(tmp_path)

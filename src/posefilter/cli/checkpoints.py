@@ -91,6 +91,8 @@ def find_checkpoint(path: str | Path | None) -> Path:
     file = find_weights(path)
     if file.is_dir():
         file = file / "checkpoints" / "best.ckpt"
+        if not file.is_file():
+            raise UserError(f"checkpoint={path}: is a folder without checkpoints/best.ckpt")
     if not file.is_file():
         raise UserError(f"checkpoint={path}: no such file")
     return file
