@@ -166,3 +166,14 @@ def test_numbers_are_four_or_a_matrix() -> None:
     for wrong in ("1,2,3", [*K.T.ravel()], "none.json", "1,2,x,4", None):
         with pytest.raises(UserError, match=r"^intrinsics="):
             read_intrinsics(wrong)
+
+
+def test_a_matrix_that_numpy_saved_is_read(tmp_path: Path) -> None:
+    file = tmp_path / "K.npy"
+    np.save(file, K)
+    np.testing.assert_allclose(read_camera_file(file).K, K)
+    np.save(file, [*FOUR.values()])
+    np.testing.assert_allclose(read_camera_file(file).K, K)
+    np.save(file, np.eye(4))
+    with pytest.raises(BadData, match=r"K\.npy: holds no camera \(16 words; expected a matrix"):
+        read_camera_file(file)

@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from posefilter.data.readers.decode import numbers, whole_number
+from posefilter.data.readers.decode import numbers, read_array, whole_number
 from posefilter.errors import BadData
 from posefilter.limits import read_json, read_lines, read_yaml
 
@@ -34,7 +34,7 @@ class CameraFile(NamedTuple):
 
 
 def read_camera_file(path: Path) -> CameraFile:
-    """Read JSON, YAML, or a text of a matrix (3, 3) or of fx, fy, cx, cy.
+    """Read JSON, YAML, or a text or `.npy` of a matrix (3, 3) or of fx, fy, cx, cy.
 
     Known are fx, fy, cx, cy by name (BOP's `camera.json`, RealSense with ppx, ppy), a matrix of
     nine numbers, by rows or by columns (Open3D), ROS's camera_info and its calibration files, and
@@ -48,7 +48,11 @@ def read_camera_file(path: Path) -> CameraFile:
         return _of_mapping(read_yaml(path, _LARGEST), path)
     if ending == ".json":
         return _of_mapping(read_json(path, _LARGEST), path)
-    words = " ".join(read_lines(path)).translate(str.maketrans(",;[]()", "      ")).split()
+    words: Any
+    if ending == ".npy":
+        words = read_array(path).ravel()
+    else:
+        words = " ".join(read_lines(path)).translate(str.maketrans(",;[]()", "      ")).split()
     found = {"numbers": words}
     if len(words) == 4:
         fx, fy, cx, cy = numbers(found, "numbers", path, (4,)).tolist()

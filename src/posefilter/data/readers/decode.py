@@ -162,7 +162,7 @@ def _is_array(path: Path) -> bool:
 
 
 def _read_numbers(path: Path) -> np.ndarray:
-    return _read_array(path) if _is_array(path) else decode_image(read_bytes(path), path)
+    return read_array(path) if _is_array(path) else decode_image(read_bytes(path), path)
 
 
 def decode_image(data: bytes, path: Path, mode: int = cv2.IMREAD_UNCHANGED) -> np.ndarray:
@@ -187,7 +187,7 @@ def decode_image(data: bytes, path: Path, mode: int = cv2.IMREAD_UNCHANGED) -> n
     return image
 
 
-def _read_array(path: Path) -> np.ndarray:
+def read_array(path: Path) -> np.ndarray:
     """Read an array of numbers of a NumPy file, no larger than the file is."""
     data = io.BytesIO(read_bytes(path))
     try:
