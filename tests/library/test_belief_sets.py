@@ -181,12 +181,21 @@ def test_symmetries_are_saved_and_files_without_them_are_read(tmp_path: Path) ->
     for name, symmetries in (
         ("flat", np.eye(4)),
         ("mirror", np.diag([-1.0, 1, 1, 1])[None]),
-        ("many", np.repeat(np.eye(4)[None], 1001, 0)),
+        ("many", np.repeat(np.eye(4)[None], 10_001, 0)),
     ):
         np.savez(tmp_path / f"{name}.npz", **arrays, symmetries=symmetries)
         with pytest.raises(UserError, match=f"{name}.npz: belief: .*symmetries") as caught:
             Belief.load(tmp_path / f"{name}.npz")
         assert "\n" not in str(caught.value)
+
+
+def test_a_ball_has_a_belief_too() -> None:
+    """Its symmetries are 36 squared turns, where nothing else is set."""
+    lines = [(axis, CENTER) for axis in np.eye(3)[:2]]
+    ball = symmetry_group(continuous=lines)
+    belief = belief_of(draw(20, 13), symmetries=ball)
+    assert len(belief.symmetries) == 36**2
+    assert np.isfinite(belief.covariance_about(middle().numpy())).all()
 
 
 def test_poses_of_three_rows_are_taken_and_what_is_no_pose_is_refused() -> None:

@@ -38,7 +38,7 @@ from posefilter.geometry.pose_statistics import covariance_about, twist_between
 from posefilter.geometry.spaces import PoseSpace
 from posefilter.geometry.symmetries import densify, gather_copies
 
-_MOST_SYMMETRIES = 1000
+_MOST_SYMMETRIES = 10_000  # as many as an object may have (meshes/symmetries.py)
 _ROUNDING = 1e-9  # of weights' sum, which float64 keeps
 _SAME_OBJECT = 1e-5  # [m] by which single precision may change an object's sizes
 
