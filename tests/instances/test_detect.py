@@ -17,6 +17,8 @@ from posefilter.geometry.camera import back_project
 from posefilter.geometry.pose import make_pose
 from posefilter.instances.detect import Detection, _begin, _is_open, detect, resolve
 from posefilter.models.base import PoseEstimator
+from posefilter.models.pose_particles import require_depth
+from posefilter.nets.pose_votes import measure_cells
 from posefilter.protocols import Resample
 from posefilter.types import Batch, BeliefBatch, ObjectModel, Trace
 
@@ -83,6 +85,14 @@ class Beside(SimpleFilter):
         return SimpleNamespace(belief=BeliefBatch(pose[:, None], torch.zeros(1, 1), pose, score))
 
 
+class Proposing(SimpleFilter):
+    """Needs a cell with depth, as proposals do."""
+
+    def __call__(self, batch: Batch, method: Any, generator: Generator) -> Any:
+        require_depth(measure_cells(batch.depth, batch.intrinsics).valid)
+        return super().__call__(batch, method, generator)
+
+
 def draw(squares: Sequence[tuple[int, int, int, float]]) -> Batch:
     """Return an image of squares (u, v, channel, brightness) at 1 m, before a wall at 2 m."""
     rgb, depth = torch.zeros(1, 3, H, W), torch.full((1, 1, H, W), 2.0)
@@ -109,6 +119,14 @@ def corners(found: list[Detection]) -> list[tuple[int, int]]:
 
 
 THREE = [(4, 5, 0, 0.95), (30, 20, 0, 0.9), (50, 36, 0, 0.85)]
+
+
+def test_what_is_found_is_kept_where_too_little_depth_is_left_for_another_search() -> None:
+    batch, toy = draw([(2, 2, 0, 0.95)]), Toy(0)
+    toy.filter = Proposing()
+    batch.depth[batch.depth > 1] = 0
+    batch.depth[0, 0, 40, 56] = 2.0  # a cell's corner
+    assert len(run([toy], [2], batch)) == 1
 
 
 def test_each_instance_is_found_once_the_most_probable_first() -> None:

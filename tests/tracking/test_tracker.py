@@ -20,6 +20,8 @@ from posefilter.filters.icp import PointToPlaneIcp
 from posefilter.filters.refine import Compose
 from posefilter.filters.texture import TextureRotations
 from posefilter.geometry.rotation import random_rotation
+from posefilter.models.pose_particles import require_depth
+from posefilter.nets.pose_votes import measure_cells
 from posefilter.tracking.components import RotateTogether
 from posefilter.tracking.motion import ConstantVelocity
 from posefilter.tracking.objectness import measure_objectness
@@ -359,6 +361,30 @@ def test_later_frames_may_be_covered_and_cameras_be_of_any_kind() -> None:
         assert tracker.update(RGB, DEPTH, camera).is_tracked
     with pytest.raises(UserError, match="one size"):
         tracker.update(RGB, DEPTH, [[1.0, 0.0], [0.0, 1.0, 0.0]])
+
+
+def test_a_frame_of_whose_cells_none_has_depth_is_passed_over(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """No pose can be proposed there, though not every pixel is unknown."""
+    toy, estimator = make_toy()
+    toy.truth = walk_pose(1)[0]
+    tracker = posefilter.Tracker(estimator, TrackerSettings(whole_image_every=1))
+    propose = toy.propose_poses
+
+    def propose_poses(encoding: Any, particles: int, generator: torch.Generator) -> torch.Tensor:
+        require_depth(measure_cells(depth, torch.from_numpy(K)[None].float()).valid)
+        return propose(encoding, particles, generator)
+
+    monkeypatch.setattr(toy, "propose_poses", propose_poses)
+    corners = NONE.copy()
+    corners[::8, ::8] = DEPTH[::8, ::8]
+    for z, covered in ((DEPTH, False), (corners, True), (DEPTH, False)):
+        depth, before = torch.from_numpy(z)[None, None], len(toy.encoded)
+        result = tracker.update(RGB, z, K)
+        assert not result.blank
+        assert result.is_tracked
+        assert (len(toy.encoded) == before) == covered
 
 
 def test_masked_depth_is_unknown_in_every_frame() -> None:

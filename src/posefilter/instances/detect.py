@@ -18,6 +18,7 @@ from posefilter.filters.resample import NoResampling
 from posefilter.instances.pixels import keep_pixels, resize_mask
 from posefilter.models.base import PoseEstimator
 from posefilter.models.zoom import search
+from posefilter.nets.pose_votes import has_depth
 from posefilter.protocols import Encoding
 from posefilter.types import Batch, BeliefBatch, Trace
 
@@ -132,8 +133,8 @@ def _search(
     job.searches += 1
     hidden = _hide(job, [x for x in found if x.number == job.number or x.probability >= _LIKELY])
     image, encoding = _encode(job, hidden)
-    one = None
-    if bool(image.depth.any()) and (job.searches == 1 or float(measure_worth(encoding)) >= _WORTH):
+    one, worth = None, job.searches == 1 or float(measure_worth(encoding)) >= _WORTH
+    if worth and bool(has_depth(image).all()):
         trace = search(job.method, image, job.generator, encoding, job.filter)
         depth, K = job.batch.depth[0, 0], job.batch.intrinsics[0]
         visible = find_visible(trace.belief.best, job.method.object_model, depth, K)[0]

@@ -23,7 +23,7 @@ from posefilter.filters.loop import ParticleFilter
 from posefilter.filters.traces import map_traces
 from posefilter.geometry.camera import project, resize_intrinsics
 from posefilter.geometry.pose import origin_of
-from posefilter.nets.pose_votes import measure_cells
+from posefilter.nets.pose_votes import has_depth
 from posefilter.protocols import Encoding
 from posefilter.types import Batch, ObjectModel, Particles, Trace
 
@@ -186,7 +186,7 @@ def _has_depth(view: Batch) -> Tensor:
     the proposal network's cells.
     """
     enough = (view.depth > 0).flatten(1).float().mean(1) >= LEAST_DEPTH
-    return enough & measure_cells(view.depth, view.intrinsics).valid.flatten(1).any(1)
+    return enough & has_depth(view)
 
 
 def magnify(batch: Batch, pixels: Tensor, zoom: Tensor) -> Batch:

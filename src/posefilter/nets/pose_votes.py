@@ -6,6 +6,7 @@ from torch import Generator, Tensor
 from posefilter.geometry.camera import back_project, pixel_grid
 from posefilter.geometry.votes import draw_votes
 from posefilter.nets.coordinates import STRIDE, Cells, Coordinates, whole_cells
+from posefilter.types import Batch
 
 
 def measure_cells(depth: Tensor, K: Tensor) -> Cells:
@@ -31,6 +32,11 @@ def measure_cells(depth: Tensor, K: Tensor) -> Cells:
         pixel = torch.where(take[..., None], corner + offset, pixel)
     point = back_project(pixel.flatten(1, 2), z.flatten(1), K).unflatten(1, (h, w))
     return Cells(point, z > 0)
+
+
+def has_depth(batch: Batch) -> Tensor:
+    """Return in which images a pose can be proposed, since a cell has depth.  -> (B,) bool."""
+    return measure_cells(batch.depth, batch.intrinsics).valid.flatten(1).any(1)
 
 
 def draw_poses(

@@ -26,6 +26,7 @@ from posefilter.geometry.pose_statistics import twist_between
 from posefilter.geometry.spaces import PoseSpace
 from posefilter.images import Images
 from posefilter.models.base import PoseEstimator
+from posefilter.nets.pose_votes import has_depth
 from posefilter.protocols import Refine
 from posefilter.result import Result, Run, make_result
 from posefilter.tracking.components import FromBelief, ModeMean, RotateTogether, smooth
@@ -195,7 +196,7 @@ class Track:
             window = self._choose_window(frame.images, predicted)
         seen = frame.see_whole(self.size) if window is None else frame.see_window(window)
         batch = Batch(*(x.to(self.method.device) for x in seen))
-        if rests or frame.blank or not bool(batch.depth.any()):
+        if rests or frame.blank or not bool(has_depth(batch).all()):
             sight = FrameEstimate(batch)
         elif predicted is None:
             sight = self._estimate(batch)
