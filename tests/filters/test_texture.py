@@ -99,6 +99,19 @@ def test_a_coarser_print_has_the_mean_colors_around_its_points_and_none_through_
     assert coarse[:, 8].mean() == pytest.approx(float(noise.mean()), abs=0.03)
 
 
+def test_a_coarser_texture_has_a_color_at_each_point_wherever_the_mesh_is() -> None:
+    """Points that are the same up to rounding have a color of their own."""
+    g = Generator().manual_seed(0)
+    normal = torch.nn.functional.normalize(torch.randn(3000, 3, generator=g), dim=1)
+    place = 0.05 * normal + torch.tensor([3.0, 0.0, 0.0])
+    texture = torch.cat([place, normal, torch.rand(3000, 3, generator=g)], dim=1)
+    model = load("carton")
+    for points in (texture, texture.repeat(2, 1)):
+        coarse = coarsen_texture(model._replace(texture=points), 800).texture
+        assert coarse is not None
+        assert coarse.isfinite().all()
+
+
 def test_a_coarser_texture_is_made_once_and_not_kept_for_ever() -> None:
     model = load("carton")
     assert model.texture is not None

@@ -133,6 +133,7 @@ def _average(texture: Tensor, most: int, side: float) -> Tensor:
     # every so many: points are drawn face by face, and the first ones are of some faces alone
     chosen = torch.arange(most, device=texture.device) * len(texture) // most
     nearest = torch.cdist(places, places[chosen]).argmin(1)
+    nearest[chosen] = torch.arange(most, device=nearest.device)  # whatever rounding says
     total = places.new_zeros(most, 4).index_add(
         0, nearest, torch.cat([texture[:, 6:].float(), places.new_ones(len(texture), 1)], dim=1)
     )
