@@ -69,7 +69,8 @@ class PixelFilter:
         s, rule = self.settings, self.settings["estimate"]
         point, share, position = (found[name] for name in ("point", "share", "position"))
         likelihood, scale = np.exp(found["log_likelihood"]), rule["scale_m"]
-        weight, center = likelihood * found["known"], np.float32(s["center"])
+        relative = np.exp(found["log_likelihood"] - found["log_likelihood"].max())
+        weight, center = relative * found["known"], np.float32(s["center"])
         count = rule["hypotheses"]
         votes = draw_poses(point, weight, share, position, center, s["radius"], count, rng)
         weight = weight + 1e-9

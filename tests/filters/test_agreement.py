@@ -60,6 +60,27 @@ def test_agreement_beats_the_best_particle_and_shrugs_off_a_third_of_outliers() 
     assert ((belief.score > 0.4) & (belief.score < 0.8)).all()  # about two thirds agree
 
 
+@pytest.mark.parametrize("constant", [-100.0, -40.0, 60.0, 100.0])
+def test_a_constant_of_the_image_changes_no_pose(constant: float) -> None:
+    g = torch.Generator().manual_seed(0)
+    thing = torch.rand(1, 300, 3, generator=g) * 0.2 - 0.1
+    right = torch.rand(1, 300, generator=g) < 0.25  # few, and likely
+    truth, other = (
+        make_pose(exp_so3(torch.tensor([x, 0.2, 0.1])), torch.tensor([x, 0.0, 1.0]))
+        for x in (0.1, -0.3)
+    )
+    point = torch.where(right[..., None], transform(truth, thing), transform(other, thing))
+    pose = torch.where(right[..., None, None], truth, other)
+    log_p = torch.where(right, -1.0, -6.0) + constant
+    empty = torch.zeros(1, 300, 0)
+    particles = Particles(
+        torch.zeros(1, 300, 2), empty, log_p.log_softmax(1), torch.arange(300)[None]
+    )
+    output = ParticleOutput(log_p, torch.zeros(1, 300, 2), pose, empty)
+    belief = Agreement()(particles, output, None, Points(point), g)  # type: ignore[arg-type]
+    torch.testing.assert_close(belief.best[0], truth, atol=1e-3, rtol=0)
+
+
 def test_particles_that_cannot_tell_two_sides_apart_agree_on_the_one_that_fits_all() -> None:
     """Six in ten hold the point's mirror image likelier than the point; no particle's own pose is
     near the truth.

@@ -73,7 +73,9 @@ class Agreement:
         center, radius = object_model.center.to(particles.state), object_model.radius
         point, measured = method.surface_points(encoding, particles.state)
         share, position = self.list_object_points(output, point, center, radius)
-        weight = output.log_likelihood.detach().exp() * measured
+        log_likelihood = output.log_likelihood.detach()
+        # known up to a constant of the image
+        weight = (log_likelihood - log_likelihood.amax(1, keepdim=True)).exp() * measured
         votes = draw_votes(
             point, weight, share, position, center, radius, self.hypotheses, generator
         )
