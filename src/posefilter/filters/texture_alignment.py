@@ -61,7 +61,8 @@ class TextureAlignment:
 
     Args:
         iterations: Gauss-Newton steps.
-        initial_blur: Blur in the first step, in units of the last; geometric between.
+        initial_blur: Blur of an estimate before the first step, in units of the last step's; each
+            step's is smaller by the same factor.
         prior: Standard deviation of the estimate before [m on the object's surface].
         independent: Share of the textured points that count as independent.
         min_correlation: Of the object's colors with the image's; below, they are not used.

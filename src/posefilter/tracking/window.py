@@ -81,8 +81,8 @@ def place_window(
         window_scale: Half the window's side, in projected radii of the object.
 
     Returns:
-        The window, cut at the photograph's edges; None where it would hold the whole photograph or
-        none of it, or where the object is behind the camera.
+        The window, cut at the photograph's edges; None where it would hold next to nothing of the
+        photograph, or where the object is behind the camera.
     """
     x, y, z = (pose[:3, :3] @ object_model.center.double().numpy() + pose[:3, 3]).tolist()
     if z <= object_model.radius / 2:
