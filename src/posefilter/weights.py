@@ -41,7 +41,8 @@ def find_weights(weights: str | Path | None) -> Path:
         )
     if not isinstance(weights, str | os.PathLike):
         raise UserError(f"checkpoint={weights}: must be a file, a run's folder or a name")
-    path, name = Path(weights), str(weights)
+    # that of Path raises where there is no such user
+    path, name = Path(os.path.expanduser(weights)), str(weights)  # noqa: PTH111
     if path.exists():
         return path
     if is_several(name) and name != ALL:  # a pattern of one file

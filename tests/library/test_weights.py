@@ -79,6 +79,16 @@ def test_a_path_is_taken_as_it_is_and_a_name_is_found_among_what_ships(tmp_path:
     assert find_weights("003_cracker_box").is_file()
 
 
+def test_a_path_may_begin_at_the_home_folder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("HOME", str(tmp_path))
+    (tmp_path / "own.ckpt").write_bytes(b"")
+    assert find_weights("~/own.ckpt") == tmp_path / "own.ckpt"
+    with pytest.raises(UserError, match="~nobody_of_that_name"):
+        find_weights("~nobody_of_that_name/own.ckpt")
+
+
 def test_a_pattern_may_stand_for_one_file(tmp_path: Path) -> None:
     """As that of a run whose folder's name is cut."""
     own = tmp_path / "model=patch_pf,see_83de" / "best.ckpt"
