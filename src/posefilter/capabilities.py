@@ -20,6 +20,7 @@ Capabilities = tuple[Capability, ...]
 MEANINGS: Mapping[str, str] = {
     "heatmaps": "training on maps of keypoints alone",
     "candidates": "scored candidate poses",
+    "common_points": "a likelihood that reads the same image points for all poses",
     "color": "a method whose encodings keep the image's colors",
     "correspondences": "training on dense object coordinates alone",
     "depth": "a method whose encodings keep the measured depth",

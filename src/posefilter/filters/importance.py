@@ -43,7 +43,7 @@ class ImportanceSampling:
         UserError: A number is out of range.
     """
 
-    requires: ClassVar[Capabilities] = ("pose_space", "score_poses")
+    requires: ClassVar[Capabilities] = ("common_points", "pose_space", "score_poses")
 
     samples: int = 400
     rounds: int = 2

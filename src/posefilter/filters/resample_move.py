@@ -65,7 +65,7 @@ class ResampleMove:
         UserError: A number is out of range.
     """
 
-    requires: ClassVar[Capabilities] = ("pose_space", "score_poses")
+    requires: ClassVar[Capabilities] = ("common_points", "pose_space", "score_poses")
 
     def __init__(
         self,

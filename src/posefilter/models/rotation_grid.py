@@ -67,7 +67,13 @@ class RotationGrid(PoseParticles):
         **base: Arguments of `PoseEstimator`.
     """
 
-    provides: ClassVar[Capabilities] = ("grid_scores", "pose", "pose_space", "score_poses")
+    provides: ClassVar[Capabilities] = (
+        "common_points",  # a crop is seen whole
+        "grid_scores",
+        "pose",
+        "pose_space",
+        "score_poses",
+    )
     test_only_settings = ("filter", "train_filter")  # training rolls out no filter
     codes: Tensor
     grid: Tensor

@@ -149,7 +149,7 @@ class PoseLikelihood(nn.Module):
         ray: Whether the network is given the viewing ray (in an ablation it is 0).
     """
 
-    provides: ClassVar[Capabilities] = ("score_points",)
+    provides: ClassVar[Capabilities] = ("common_points", "score_points")
 
     def __init__(
         self,
