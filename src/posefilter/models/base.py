@@ -245,11 +245,14 @@ class PoseEstimator(Module):
         """
         if not isinstance(self, ScoresPoses):
             return None
-        encoding = self.encode(batch) if trace.encoding is None else trace.encoding
         # the same image points each time: an estimate is as probable as before
         generator = torch.Generator(device=self.device).manual_seed(self.seed)
-        own = (LEARNED_SIGMA, generator, LEARNED_PIXELS)
-        return lambda poses: self.score_poses(encoding, poses, *own)
+
+        def score(poses: Tensor) -> Tensor:
+            encoding = self.encode(batch) if trace.encoding is None else trace.encoding
+            return self.score_poses(encoding, poses, LEARNED_SIGMA, generator, LEARNED_PIXELS)
+
+        return score
 
     def measure_apparent_size(self, trace: Trace, batch: Batch) -> ApparentSize | None:
         """Return how large the object appears, relative to its mesh; None where the method cannot
