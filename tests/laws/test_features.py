@@ -7,11 +7,11 @@ from typing import Any
 import pytest
 import torch
 
-from posefilter.confidence.features import measure_coordinates, measure_depth
+from posefilter.confidence.features import measure_belief, measure_coordinates, measure_depth
 from posefilter.geometry.pose import make_pose, transform
 from posefilter.geometry.rotation import exp_so3
 from posefilter.nets.coordinates import Cells, Coordinates
-from posefilter.types import ObjectModel
+from posefilter.types import BeliefBatch, ObjectModel
 
 RADIUS = 0.1
 
@@ -79,3 +79,29 @@ def test_what_is_seen_through_speaks_against_a_pose_and_what_hides_it_says_nothi
     found = measure_depth(pose, seen, MODEL)
     assert float(found["surface"]) == 0
     assert float(found["free_space"]) == pytest.approx(free, abs=1e-3)
+
+
+def test_particles_at_equivalent_poses_agree() -> None:
+    half = make_pose(exp_so3(torch.tensor([0.0, 0.0, math.pi])), torch.zeros(3))
+    turns = exp_so3(torch.arange(36)[:, None] * torch.tensor([0.0, 0.0, 2 * math.pi / 36]))
+    round_ = make_pose(turns, torch.zeros(36, 3))
+    best = make_pose(exp_so3(torch.tensor([0.3, -0.2, 0.1])), torch.tensor([0.1, 0.0, 1.0]))
+    generator = torch.Generator().manual_seed(0)
+    near = make_pose(exp_so3(0.02 * torch.randn(50, 3, generator=generator)), torch.zeros(50, 3))
+    between = make_pose(exp_so3(torch.tensor([0.0, 0.0, 0.05])), torch.zeros(3))
+
+    def measure(symmetries: torch.Tensor, turn: torch.Tensor) -> dict[str, torch.Tensor]:
+        own = best @ near
+        own = torch.cat([own[:25], own[25:] @ turn])
+        belief = BeliefBatch(own[None], torch.full((1, 50), 0.02).log(), best[None], torch.ones(1))
+        return measure_belief(belief, MODEL._replace(symmetries=symmetries))
+
+    eye = torch.eye(4)
+    alone, apart = (measure(eye[None], turn)["concentration"] for turn in (eye, half))
+    assert float(alone) > 4 > 0 > float(apart)
+    pair = measure(torch.stack([eye, half]), half)
+    assert "concentration" not in pair
+    assert float(pair["concentration_up_to_symmetry"]) == pytest.approx(float(alone), abs=1e-3)
+    # a continuous symmetry is known by a few of its turns
+    any_turn = measure(round_, half @ between)["concentration_up_to_symmetry"]
+    assert float(any_turn) >= float(alone)

@@ -174,7 +174,7 @@ class Calibration:
         missing = [name for name in self.features if name not in values]
         if missing:
             raise UserError(
-                f"calibration: belongs to another method, whose features have {missing[0]}; "
+                f"calibration: is of another method or version, whose features have {missing[0]}; "
                 "calibrate the checkpoint again"
             )
         return torch.stack([values[name].detach().double().cpu() for name in self.features], dim=-1)

@@ -19,6 +19,7 @@ from posefilter.geometry.lookup import gather_pixels, nearest_pixel
 from posefilter.geometry.pose import invert, transform
 from posefilter.geometry.pose_error import subsample
 from posefilter.geometry.spaces import PoseSpace
+from posefilter.geometry.symmetries import densify, gather_copies
 from posefilter.nets.coordinates import Cells, Coordinates
 from posefilter.types import Batch, BeliefBatch, ObjectModel
 
@@ -39,12 +40,21 @@ def measure_belief(belief: BeliefBatch, object_model: ObjectModel) -> dict[str, 
     Returns:
         (B,) each. `score`: the estimate's log-likelihood. `concentration`: the negative logarithm
         of the particles' root mean square distance from the estimate (`PoseSpace`), in diameters.
+        Particles at poses that a symmetry makes one agree; it is `concentration_up_to_symmetry`
+        then, since calibrations of earlier versions know another number by the first name.
     """
     space = PoseSpace(tuple(object_model.center.tolist()), object_model.radius)
-    weights = belief.log_weights.exp()
-    distance = space.distance(belief.poses, belief.best[:, None]) / object_model.diameter
+    weights, best, poses = belief.log_weights.exp(), belief.best, belief.poses
+    name = "concentration"
+    if len(object_model.symmetries) > 1:
+        name = "concentration_up_to_symmetry"
+        group = densify(object_model.symmetries.to(best))
+        place = object_model.center.to(best), object_model.radius, group
+        pairs = zip(poses, best, strict=True)
+        poses = torch.stack([gather_copies(own, about, *place) for own, about in pairs])
+    distance = space.distance(poses, best[:, None]) / object_model.diameter
     spread = (weights * distance.square()).sum(1).sqrt()
-    return {"score": belief.score, "concentration": -spread.clamp(1e-3, 1e3).log()}
+    return {"score": belief.score, name: -spread.clamp(1e-3, 1e3).log()}
 
 
 def measure_depth(best: Tensor, batch: Batch, object_model: ObjectModel) -> dict[str, Tensor]:
