@@ -72,7 +72,7 @@ def test_agreement_is_refused_where_no_particle_knows_its_surface_point_of_the_o
 class Pixels:
     """A method whose particles are pixels, and a part of it."""
 
-    provides = ("pixel_space", "pose")
+    provides: tuple[str, ...] = ("pixel_space", "pose")
 
     def __init__(self, part: object) -> None:
         self.part = part
@@ -81,7 +81,13 @@ class Pixels:
 class Poses(Pixels):
     """The same, whose particles are poses."""
 
-    provides = ("pose_space", "pose")
+    provides: tuple[str, ...] = ("pose_space", "pose")
+
+
+class CommonPoses(Poses):
+    """The same, with a likelihood that reads the same points for all."""
+
+    provides = ("common_points", "pose_space", "pose")
 
 
 @pytest.mark.parametrize(
@@ -101,6 +107,8 @@ class Poses(Pixels):
         (Poses, Gradient(), "score_poses"),
         (Poses, ImportanceSampling(), "common_points"),
         (Poses, ResampleMove(), "common_points"),
+        (CommonPoses, ImportanceSampling(), "score_poses"),
+        (CommonPoses, ResampleMove(), "score_poses"),
         (Poses, PointToPlaneIcp(), "depth"),
         (Poses, TextureRotations(), "color"),
         (Poses, Contrastive(), "candidates"),

@@ -162,8 +162,9 @@ class Calibration:
 
     def choice_ignores(self, feature: str) -> bool:
         """Return whether a feature has no part in what answers to one image are compared by."""
-        weights = () if self.choice is None else self.choice.weights
-        return not dict(zip(self.features, weights, strict=False)).get(feature, True)
+        if self.choice is None or feature not in self.features:
+            return False
+        return self.choice.weights[self.features.index(feature)] == 0
 
     def standardize(self, values: Mapping[str, Tensor]) -> Tensor:
         """Return features (B,) by name as the regressions take them, (B, F) float64."""

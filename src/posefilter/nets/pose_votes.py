@@ -8,6 +8,8 @@ from posefilter.geometry.votes import draw_votes
 from posefilter.nets.coordinates import STRIDE, Cells, Coordinates, whole_cells
 from posefilter.types import Batch
 
+_BEFORE = STRIDE // 2 - 1  # [px] the central pixel of a cell's four that is nearest to its corner
+
 
 def measure_cells(depth: Tensor, K: Tensor) -> Cells:
     """Lift one depth pixel of each cell to a camera point.  (B, 1, H, W) [m], (B, 3, 3) -> Cells.
@@ -18,17 +20,15 @@ def measure_cells(depth: Tensor, K: Tensor) -> Cells:
     depth = whole_cells(depth)
     B, _, H, W = depth.shape
     h, w = H // STRIDE, W // STRIDE
-    blocks = depth[:, 0].unflatten(1, (h, STRIDE)).unflatten(3, (w, STRIDE))
-    center = STRIDE // 2
-    before = center - 1
+    middle = _list_central(depth)
     z = torch.zeros(B, h, w, dtype=depth.dtype, device=depth.device)
     grid = pixel_grid(H, W, STRIDE, device=depth.device)
     pixel, corner = grid.expand(B, -1, -1, -1), grid - (STRIDE - 1) / 2
-    for row, col in ((before, before), (center, center), (before, center), (center, before)):
-        candidate = blocks[:, :, row, :, col]
+    for row, col in ((0, 0), (1, 1), (0, 1), (1, 0)):
+        candidate = middle[:, :, row, :, col]
         take = (z == 0) & (candidate > 0)
         z = torch.where(take, candidate, z)
-        offset = torch.tensor([col, row], dtype=depth.dtype, device=depth.device)
+        offset = torch.tensor([col, row], dtype=depth.dtype, device=depth.device) + _BEFORE
         pixel = torch.where(take[..., None], corner + offset, pixel)
     point = back_project(pixel.flatten(1, 2), z.flatten(1), K).unflatten(1, (h, w))
     return Cells(point, z > 0)
@@ -36,7 +36,15 @@ def measure_cells(depth: Tensor, K: Tensor) -> Cells:
 
 def has_depth(batch: Batch) -> Tensor:
     """Return in which images a pose can be proposed, since a cell has depth.  -> (B,) bool."""
-    return measure_cells(batch.depth, batch.intrinsics).valid.flatten(1).any(1)
+    return (_list_central(whole_cells(batch.depth)) > 0).flatten(1).any(1)
+
+
+def _list_central(depth: Tensor) -> Tensor:
+    """Return the central pixels of whole cells.  (B, 1, H, W) -> (B, h, 2, w, 2)."""
+    _, _, H, W = depth.shape
+    blocks = depth[:, 0].unflatten(1, (H // STRIDE, STRIDE)).unflatten(3, (W // STRIDE, STRIDE))
+    two = slice(_BEFORE, _BEFORE + 2)
+    return blocks[:, :, two, :, two]
 
 
 def draw_poses(

@@ -44,7 +44,6 @@ _MODE = 0.02  # [m] about the best particle, over which the estimate is a mean
 # by how much errors of a track are larger than those of the calibrated filter, whose estimate is
 # refined more: of five objects in rendered sequences
 _WIDENING = 1.3
-_TEXTURE_EVERY = 8  # frames, for the margin of the rotation where there are no turns by texture
 _ICP_STEPS = 2  # a tracked estimate starts close: more cost a tenth of a frame's time
 
 
@@ -161,21 +160,20 @@ class Track:
     @property
     def snapshot(self) -> TrackSnapshot:
         """What the next frame depends on."""
-        random = self.generator.get_state()
-        own = (
+        return TrackSnapshot(
+            self.generator.get_state(),
             self.state,
             self.loss_detector,
             self.frames,
             self.apparent_size,
             self.rotation_margin,
         )
-        return TrackSnapshot(random, *own)
 
     @snapshot.setter
     def snapshot(self, snapshot: TrackSnapshot) -> None:
         self.generator.set_state(snapshot.random)
-        _, self.state, self.loss_detector, self.frames, *_ = snapshot
-        self.apparent_size, self.rotation_margin = snapshot.apparent_size, snapshot.rotation_margin
+        self.state, self.loss_detector, self.frames = snapshot[1:4]
+        self.apparent_size, self.rotation_margin = snapshot[4:]
 
     @property
     def estimated_cost(self) -> float:
@@ -278,9 +276,7 @@ class Track:
         """Probe the whole image for a lost object, and search where that is worth it."""
         settings, encoding = self.settings, self.method.encode(batch)
         start = predicted.belief.state
-        probed, _ = self._filter(
-            batch, encoding, start, settings.probe, self._refine(0), with_margin=False
-        )
+        probed, _ = self._filter(batch, encoding, start, settings.probe, self._refine(0))
         if probed.presence < settings.search_above and not self._search_is_due:
             return probed
         assert probed.belief is not None
@@ -410,7 +406,7 @@ class Track:
     @property
     def _margin_is_due(self) -> bool:
         """Whether the rotation's margin is measured, which of a can costs as much as a frame."""
-        every = self.settings.texture_every or _TEXTURE_EVERY
+        every = self.settings.texture_every or TrackerSettings.texture_every
         # after every other turn by the texture
         return (self.frames + self.phase) % (2 * every) == every // 4
 
