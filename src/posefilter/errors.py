@@ -3,9 +3,10 @@
 import math
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from numbers import Integral
+from numbers import Integral, Real
 from pathlib import Path
 from signal import Signals
+from typing import Any
 
 MISTAKE, FAILURE, INTERRUPTED = 2, 1, 130  # exit statuses
 
@@ -36,6 +37,13 @@ def check_choice(key: str, value: object, *choices: str) -> None:
     """Raise UserError, naming the key, unless a setting is one of its choices."""
     if value not in choices:
         raise UserError(f"{key}={value!r} is unknown: choose {' or '.join(choices)}")
+
+
+def check_positive(key: str, value: Any) -> None:
+    """Raise UserError, naming the key, unless a setting is a number above 0."""
+    number = isinstance(value, Real) and not isinstance(value, bool)
+    if not (number and 0 < value < math.inf):
+        raise UserError(f"{key}={value}: must be a positive number")
 
 
 def check_range(key: str, value: Sequence[float], least: float = -math.inf) -> tuple[float, float]:

@@ -6,14 +6,13 @@ import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields
 from functools import reduce
-from numbers import Real
 from operator import and_
 from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
-from posefilter.errors import UserError
+from posefilter.errors import UserError, check_positive
 from posefilter.geometry.pose import origin_of, rotation_of
 from posefilter.geometry.rotation import angle_between
 from posefilter.geometry.symmetries import densify, list_equivalent
@@ -56,9 +55,7 @@ class PoseTolerance:
         """Check the numbers."""
         given = {key: value for key, value in asdict(self).items() if value is not None}
         for key, value in given.items():
-            number = isinstance(value, Real) and not isinstance(value, bool)
-            if not (number and 0 < value < math.inf):
-                raise UserError(f"pose_tolerance.{key}={value}: must be a positive number")
+            check_positive(f"pose_tolerance.{key}", value)
         if not given:
             names = ", ".join(field.name for field in fields(self))
             raise UserError(f"pose_tolerance: gives none of {names}")

@@ -7,7 +7,6 @@ References:
         probabilities. Neural Computation 14 (2002).
 """
 
-import math
 from dataclasses import dataclass, fields
 from numbers import Real
 from typing import Literal
@@ -16,7 +15,7 @@ import torch
 from torch import Tensor
 
 from posefilter.confidence.calibration import Assessment
-from posefilter.errors import UserError
+from posefilter.errors import UserError, check_positive
 
 Verdict = Literal["found", "unsure", "absent"]
 
@@ -41,10 +40,7 @@ class Costs:
     def __post_init__(self) -> None:
         """Check that the costs are positive."""
         for field in fields(self):
-            value = getattr(self, field.name)
-            number = isinstance(value, Real) and not isinstance(value, bool)
-            if not (number and 0 < value < math.inf):
-                raise UserError(f"cost_{field.name}={value}: must be a positive number")
+            check_positive(f"cost_{field.name}", getattr(self, field.name))
 
 
 def check_costs(given: object) -> None:
