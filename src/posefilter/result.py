@@ -9,6 +9,7 @@ import numpy as np
 import torch
 
 from posefilter.belief import Belief, Mode, PoseSet
+from posefilter.belief.belief import belief_over
 from posefilter.belief.summaries import check_probability
 from posefilter.confidence.apparent_size import ApparentSize
 from posefilter.confidence.calibration import Assessment, Calibration
@@ -398,13 +399,6 @@ def make_belief(
         draws: (B,) as of `PoseEstimator.calibrate_belief`; None: not calibrated.
     """
     weights = beliefs.log_weights[image].double().cpu().exp().numpy()
-    return Belief(
-        beliefs.poses[image].double().cpu().numpy(),
-        weights / weights.sum(),
-        object_model.center.detach().cpu().double().numpy(),
-        float(object_model.radius),
-        float(object_model.diameter),
-        object_model.name,
-        object_model.symmetries.detach().cpu().double().numpy(),
-        0 if draws is None else int(draws[image]),
-    )
+    samples = beliefs.poses[image].double().cpu().numpy()
+    count = 0 if draws is None else int(draws[image])
+    return belief_over(object_model, samples, weights / weights.sum(), count)

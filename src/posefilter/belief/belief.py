@@ -37,6 +37,7 @@ from posefilter.geometry.pose_density import (
 from posefilter.geometry.pose_statistics import covariance_about, twist_between
 from posefilter.geometry.spaces import PoseSpace
 from posefilter.geometry.symmetries import densify, gather_copies
+from posefilter.types import ObjectModel
 
 _MOST_SYMMETRIES = 10_000  # as many as an object may have (meshes/symmetries.py)
 _ROUNDING = 1e-9  # of weights' sum, which float64 keeps
@@ -508,6 +509,16 @@ class Belief:
     @property
     def _space(self) -> PoseSpace:
         return PoseSpace(tuple(self.center.tolist()), self.radius)
+
+
+def belief_over(
+    object_model: ObjectModel, samples: np.ndarray, weights: np.ndarray, draws: int = 0
+) -> Belief:
+    """Return the belief over an object's pose that samples (N, 4, 4) [m] with weights (N,) are."""
+    parts = (object_model.center, object_model.symmetries)
+    center, symmetries = (part.detach().cpu().double().numpy() for part in parts)
+    sizes = float(object_model.radius), float(object_model.diameter)
+    return Belief(samples, weights, center, *sizes, object_model.name, symmetries, draws)
 
 
 def _as_numbers(name: str, value: Any) -> np.ndarray:

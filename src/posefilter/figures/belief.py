@@ -16,6 +16,7 @@ import numpy as np
 import torch
 
 from posefilter.belief import Belief, Uncertainty
+from posefilter.belief.belief import belief_over
 from posefilter.figures.canvas import Color, View, arrange_grid, draw_dots, halve
 from posefilter.figures.layout import (
     CAPTION,
@@ -263,16 +264,7 @@ def summarize_belief(
     """
     center = object_model.center.detach().cpu().double()
     found = find_hypotheses(poses, weights.log(), best, object_model, draws)
-    whole = Belief(
-        poses.numpy(),
-        weights.numpy(),
-        center.numpy(),
-        object_model.radius,
-        object_model.diameter,
-        object_model.name,
-        object_model.symmetries.detach().cpu().double().numpy(),
-        draws,
-    )
+    whole = belief_over(object_model, poses.numpy(), weights.numpy(), draws)
     second = found.others[0] if found.others else None
     away = turned = 0.0
     if second is not None:

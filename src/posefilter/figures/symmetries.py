@@ -1,11 +1,11 @@
 """Draw the symmetries that were found: the object as it is, and turned by each of them."""
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 
 from posefilter.figures.canvas import AXES, arrange_grid, draw_lines, draw_row
+from posefilter.geometry.rigid import move, rigid
 from posefilter.meshes.mesh import Mesh, diameter
 from posefilter.meshes.rotational_symmetries import ANY, RotationalSymmetry
 from posefilter.meshes.symmetries import rotation_about
@@ -80,10 +80,7 @@ def _place_camera(mesh: Mesh, distance: float) -> np.ndarray:
     U, _, Vt = np.linalg.svd(_VIEW)
     rotation = U @ Vt
     rotation *= np.sign(np.linalg.det(rotation))
-    out = np.eye(4)
-    out[:3, :3] = rotation
-    out[:3, 3] = np.array([0, 0, distance]) - rotation @ mesh.bounds.mean(0)
-    return out
+    return rigid(rotation, np.array([0, 0, distance]) - rotation @ mesh.bounds.mean(0))
 
 
 def _render(renderer: EmbreeRenderer, mesh: Mesh, pose: np.ndarray, K: np.ndarray) -> np.ndarray:
@@ -95,6 +92,5 @@ def _draw_axis(
     tile: np.ndarray, turn: RotationalSymmetry, camera: np.ndarray, K: np.ndarray, length: float
 ) -> None:
     ends = turn.point + np.array([[-0.4], [0.4]]) * length * turn.axis
-    points: Any = ends @ camera[:3, :3].T + camera[:3, 3]
-    pixels = points @ K.T
+    pixels = move(ends, camera) @ K.T
     draw_lines(tile, [pixels[:, :2] / pixels[:, 2:]], AXES[2], 2)

@@ -17,7 +17,7 @@ from posefilter.geometry.camera import back_project, pixel_grid, project
 from posefilter.geometry.pose import origin_of
 from posefilter.geometry.spaces import PoseSpace
 from posefilter.geometry.symmetries import densify, gather_copies
-from posefilter.meshes.mesh import Mesh, creased_normals, find_hull
+from posefilter.meshes.mesh import Mesh, creased_normals, face_normals, find_hull
 from posefilter.protocols import Space
 from posefilter.types import Batch, ObjectModel, Trace
 
@@ -217,9 +217,8 @@ def make_mesh(shape: Shape, name: str) -> Mesh:
     vertices = get_vertices(shape).astype(np.float64)
     hull = find_hull(vertices)
     faces = hull.simplices.astype(np.int64)
-    a, b, c = (vertices[faces[:, i]] for i in range(3))
     # Qhull's triangles turn either way
-    inward = (np.cross(b - a, c - a) * hull.equations[:, :3]).sum(1) < 0
+    inward = (face_normals(vertices, faces) * hull.equations[:, :3]).sum(1) < 0
     faces[inward] = faces[inward][:, ::-1]
     plain = np.full((1, 1, 3), _GREY, np.uint8)
     return Mesh(name, vertices, faces, None, plain, None, creased_normals(vertices, faces))

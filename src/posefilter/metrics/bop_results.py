@@ -14,6 +14,7 @@ import numpy as np
 
 from posefilter.errors import UserError
 from posefilter.files import open_whole_text
+from posefilter.geometry.rigid import rigid
 from posefilter.limits import open_text
 
 _NEAREST = 0.02  # [m] median distance of objects
@@ -114,14 +115,12 @@ def _parse(cells: Sequence[str], where: str) -> PoseRow:
     scene, image, object_id = (
         _whole(cell, name, where) for cell, name in zip(cells[:3], HEADER[:3], strict=True)
     )
-    pose = np.eye(4)
-    pose[:3, :3] = np.reshape([float(x) for x in _numbers(cells[4], 9, "R", where)], (3, 3))
-    pose[:3, 3] = [float(x.scaleb(-3)) for x in _numbers(cells[5], 3, "t", where)]
-    R = pose[:3, :3]
+    R = np.reshape([float(x) for x in _numbers(cells[4], 9, "R", where)], (3, 3))
+    t = [float(x.scaleb(-3)) for x in _numbers(cells[5], 3, "t", where)]
     if np.abs(R @ R.T - np.eye(3)).max() > 0.01 or np.linalg.det(R) < 0:
         raise UserError(f"{where}: R is no rotation; expected nine numbers, row by row")
     score, seconds = (_numbers(cells[i], 1, HEADER[i], where)[0] for i in (3, 6))
-    return PoseRow(scene, image, object_id, float(score), pose, float(seconds))
+    return PoseRow(scene, image, object_id, float(score), rigid(R, t), float(seconds))
 
 
 def _whole(cell: str, name: str, where: str) -> int:
