@@ -11,8 +11,7 @@ from lightning import LightningModule, Trainer
 
 from posefilter.callbacks.drawings import animate
 from posefilter.callbacks.gallery import name_frame, select_image
-from posefilter.callbacks.tensorboard import Budget, log_numbers, post_image
-from posefilter.callbacks.trace_callback import TraceCallback
+from posefilter.callbacks.tensorboard import BudgetedCallback, log_numbers, post_image
 from posefilter.figures.canvas import AXES, Color, to_image
 from posefilter.figures.curves import draw_shares
 from posefilter.figures.trajectories import draw_trajectories, trace_lineage
@@ -31,7 +30,7 @@ LISTS: dict[str, Color] = {
 NUMBERS = ("pairwise_cosine", "offset_r2", "heading", "auroc")
 
 
-class Diagnostics(TraceCallback):
+class Diagnostics(BudgetedCallback):
     """Log where the particles are, step by step, after each validation; draw it of a test, with
     trajectories of some images.
 
@@ -50,13 +49,8 @@ class Diagnostics(TraceCallback):
         images: int = 2,
         max_time_fraction: float | None = 0.005,
     ) -> None:
-        super().__init__(folder)
+        super().__init__(folder, max_time_fraction)
         self.images = images
-        self.budget = Budget(max_time_fraction)
-
-    def on_validation_epoch_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Start the clock."""
-        self.budget.start()
 
     def on_validation_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Log the shares of particles, step by step."""
@@ -73,10 +67,6 @@ class Diagnostics(TraceCallback):
             post_image(trainer, "diagnostics", picture, self.folder, step=step)
 
         self.budget.draw(draw)
-
-    def on_fit_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Draw the last validation, if that was put off."""
-        self.budget.finish()
 
     def on_test_trace(
         self, trainer: Trainer, method: PoseEstimator, trace: Trace, batch: Batch, number: int

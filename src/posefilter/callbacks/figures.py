@@ -21,8 +21,7 @@ from posefilter.callbacks.gallery import (
     name_frame,
     select_image,
 )
-from posefilter.callbacks.tensorboard import Budget, post_image
-from posefilter.callbacks.trace_callback import TraceCallback
+from posefilter.callbacks.tensorboard import BudgetedCallback, post_image
 from posefilter.data.absent import hide_annotation
 from posefilter.errors import UserError
 from posefilter.geometry.pose_error import subsample
@@ -30,7 +29,7 @@ from posefilter.models.base import PoseEstimator
 from posefilter.types import Batch, Trace
 
 
-class Figures(TraceCallback):
+class Figures(BudgetedCallback):
     """Draw figures of validations, into TensorBoard and `folder`.
 
     Neither the method nor any random generator is changed.
@@ -66,11 +65,10 @@ class Figures(TraceCallback):
                 f"callbacks.figures.exclude={unknown[0]}: there is no such figure; there are "
                 f"{', '.join(DRAWINGS)}"
             )
-        super().__init__(folder)
+        super().__init__(folder, max_time_fraction)
         self.every_n_validations = every_n_validations
         self.counts = {"first": first, "best": best, "worst": worst}
         self.drawings = {name: draw for name, draw in DRAWINGS.items() if name not in exclude}
-        self.budget = Budget(max_time_fraction)
         self._validations = 0
         self._selection = ImageSelection(**self.counts)
         self._example: tuple[KeptImage, Trace, Batch] | None = None
@@ -79,7 +77,7 @@ class Figures(TraceCallback):
     def on_validation_epoch_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Forget the last validation."""
         self._selection, self._example, self._points = ImageSelection(**self.counts), None, None
-        self.budget.start()
+        super().on_validation_epoch_start(trainer, pl_module)
 
     def on_validation_trace(
         self, trainer: Trainer, method: PoseEstimator, trace: Trace, batch: Batch
@@ -110,10 +108,6 @@ class Figures(TraceCallback):
             kept, step = self._selection.separate(), trainer.global_step
             assert isinstance(pl_module, PoseEstimator)
             self.budget.draw(partial(self._draw, trainer, pl_module, self._example, kept, step))
-
-    def on_fit_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Draw the last validation, if that was put off."""
-        self.budget.finish()
 
     def _draw(
         self,

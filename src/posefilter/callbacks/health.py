@@ -5,8 +5,7 @@ from pathlib import Path
 import torch
 from lightning import LightningModule, Trainer
 
-from posefilter.callbacks.tensorboard import Budget, log_numbers, post_image
-from posefilter.callbacks.trace_callback import TraceCallback
+from posefilter.callbacks.tensorboard import BudgetedCallback, log_numbers, post_image
 from posefilter.figures.curves import draw_health
 from posefilter.figures.particles import choose_steps
 from posefilter.geometry.spaces import PoseSpace
@@ -16,7 +15,7 @@ from posefilter.protocols import Space
 from posefilter.types import Batch, Trace
 
 
-class FilterHealth(TraceCallback):
+class FilterHealth(BudgetedCallback):
     """Average over the validation images, and log `filter/<quantity>/step_<iteration>` and one
     figure.
 
@@ -33,16 +32,15 @@ class FilterHealth(TraceCallback):
         max_iterations: int = 20,
         max_time_fraction: float | None = 0.005,
     ) -> None:
-        super().__init__(folder)
+        super().__init__(folder, max_time_fraction)
         self.max_iterations = max_iterations
-        self.budget = Budget(max_time_fraction)
         self._sums: dict[str, torch.Tensor] = {}
         self._images = 0
 
     def on_validation_epoch_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Forget the last validation."""
         self._sums, self._images = {}, 0
-        self.budget.start()
+        super().on_validation_epoch_start(trainer, pl_module)
 
     def on_validation_trace(
         self, trainer: Trainer, method: PoseEstimator, trace: Trace, batch: Batch
@@ -67,10 +65,6 @@ class FilterHealth(TraceCallback):
             post_image(trainer, "health", picture, self.folder, step=step)
 
         self.budget.draw(draw)
-
-    def on_fit_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Draw the last validation, if that was put off."""
-        self.budget.finish()
 
     def curves(self) -> dict[str, list[float]]:
         """Return the means over the images by name, one number an iteration."""

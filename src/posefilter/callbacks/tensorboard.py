@@ -7,12 +7,13 @@ from io import BytesIO
 from pathlib import Path
 
 import numpy as np
-from lightning import Trainer
+from lightning import LightningModule, Trainer
 from lightning.pytorch.loggers import TensorBoardLogger
 from PIL import Image
 from tensorboard.compat.proto.summary_pb2 import Summary
 from torch.utils.tensorboard.writer import FileWriter
 
+from posefilter.callbacks.trace_callback import TraceCallback
 from posefilter.figures.canvas import to_jpeg
 from posefilter.files import write_whole
 
@@ -138,3 +139,24 @@ class Budget:
         yield
         self.last = time.perf_counter() - start
         self.drawn += self.last
+
+
+class BudgetedCallback(TraceCallback):
+    """Base of callbacks that draw validations, in a fraction of the time that these take.
+
+    Args:
+        folder: Where files are written; None: nowhere.
+        max_time_fraction: The fraction; None: no limit.
+    """
+
+    def __init__(self, folder: str | Path | None, max_time_fraction: float | None) -> None:
+        super().__init__(folder)
+        self.budget = Budget(max_time_fraction)
+
+    def on_validation_epoch_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Start the clock."""
+        self.budget.start()
+
+    def on_fit_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Draw the last validation, if that was put off."""
+        self.budget.finish()
