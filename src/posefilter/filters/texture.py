@@ -5,6 +5,7 @@ Here the colors that the mesh has are compared with those that the image shows, 
 """
 
 from collections.abc import MutableMapping
+from dataclasses import dataclass
 from typing import ClassVar, NamedTuple
 
 import torch
@@ -276,6 +277,7 @@ def _half_width(sigma: float) -> int:
     return max(1, round(3 * sigma))
 
 
+@dataclass(eq=False)
 class TextureRotations:
     """Turn the estimate, and the particles, as the print says.
 
@@ -296,18 +298,16 @@ class TextureRotations:
 
     requires: ClassVar[Capabilities] = ("color", "depth", "pose")
 
-    def __init__(
-        self,
-        learned_weight: float = 1.0,
-        pixels: int = LEARNED_PIXELS,
-        sigma: float = LEARNED_SIGMA,
-    ) -> None:
-        if learned_weight < 0 or min(pixels, sigma) <= 0:
+    learned_weight: float = 1.0
+    pixels: int = LEARNED_PIXELS
+    sigma: float = LEARNED_SIGMA
+
+    def __post_init__(self) -> None:
+        if self.learned_weight < 0 or min(self.pixels, self.sigma) <= 0:
             raise UserError(
                 "refine: turns by texture need learned_weight >= 0, pixels and sigma above 0; got "
-                f"{learned_weight}, {pixels} and {sigma}"
+                f"{self.learned_weight}, {self.pixels} and {self.sigma}"
             )
-        self.learned_weight, self.pixels, self.sigma = learned_weight, pixels, sigma
 
     @torch.no_grad()
     def __call__(
