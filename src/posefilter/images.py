@@ -129,17 +129,20 @@ def make_sized_batch(images: Images, height: int, width: int) -> Batch:
     color = torch.from_numpy(np.ascontiguousarray(np.stack(rgb).transpose(0, 3, 1, 2)))
     color = color.float() / 255 if color.dtype == torch.uint8 else color
     z = torch.from_numpy(np.stack(depth)).float()[:, None]
-    none = torch.zeros(len(z), dtype=torch.int64)
-    return Batch(
-        color,
-        z,
-        torch.zeros_like(z, dtype=torch.bool),
-        K.float(),
-        torch.eye(4).expand(len(z), 4, 4),
-        none,
-        none,
-        torch.full((len(z),), torch.nan),
-    )
+    return make_unlabeled(color, z, K.float())
+
+
+def make_unlabeled(color: torch.Tensor, z: torch.Tensor, K: torch.Tensor) -> Batch:
+    """Return images of which no mask and no pose is known.
+
+    Args:
+        color: (B, 3, H, W) in [0, 1].
+        z: (B, 1, H, W) depth [m].
+        K: (B, 3, 3) [px].
+    """
+    none, unknown = torch.zeros(len(z), dtype=torch.int64), torch.full((len(z),), torch.nan)
+    mask, pose = torch.zeros_like(z, dtype=torch.bool), torch.eye(4).expand(len(z), 4, 4)
+    return Batch(color, z, mask, K, pose, none, none, unknown)
 
 
 def _as_channels_last(rgb: Any) -> np.ndarray:

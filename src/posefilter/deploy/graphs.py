@@ -10,6 +10,7 @@ from torch import Tensor, nn
 
 from posefilter.deploy.resizing import Resize
 from posefilter.filters.agreement import Agreement
+from posefilter.images import make_unlabeled
 from posefilter.models.image_space import ImageEncoding, ImageSpace
 from posefilter.models.pose_pf import PosePF
 from posefilter.nets.coordinates import Context, Coordinates
@@ -17,7 +18,7 @@ from posefilter.nets.encoders import ContextMap
 from posefilter.nets.likelihood import Pixels, PoseLikelihood, flatten_images, sample_points
 from posefilter.nets.pose_votes import measure_cells
 from posefilter.nets.proposals import ObjectCoordinateNet
-from posefilter.types import Batch, Particles, Step
+from posefilter.types import Particles, Step
 
 ENCODING = ("values", "smooth", "share", "position", "network_intrinsics")
 
@@ -164,7 +165,7 @@ class EncodeForPixels(nn.Module):
             `objectness` (h', w'), the probability that each cell shows the object, where particles
             are drawn by it.
         """
-        encoding = self.method.encode(_batch(*self.resize(rgb, depth, intrinsics)))
+        encoding = self.method.encode(make_unlabeled(*self.resize(rgb, depth, intrinsics)))
         kept = [encoding.image[0], encoding.depth[0], encoding.intrinsics[0]]
         kept += [level[0] for level in encoding.context.levels]
         if self.objectness:
@@ -228,9 +229,3 @@ class MeasurePixels(nn.Module):
             )
             found += [point, known.float(), share, position]
         return tuple(one[0] for one in found)
-
-
-def _batch(color: Tensor, z: Tensor, K: Tensor) -> Batch:
-    none = color.new_zeros(1, dtype=torch.int64)
-    mask = torch.zeros_like(z, dtype=torch.bool)
-    return Batch(color, z, mask, K, torch.eye(4)[None], none, none, color.new_full((1,), torch.nan))
