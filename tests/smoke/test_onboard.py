@@ -46,9 +46,11 @@ def test_it_goes_on_after_an_interruption(
     def interrupted(run: object) -> dict:
         raise Stopped(2)
 
+    monkeypatch.setattr(command, "_FEWEST_FRAMES", 12)  # rendered and measured before the others
     with monkeypatch.context() as patch:
         patch.setattr(command, "fit", interrupted)
         assert run_command("onboard", HOME, typed) == 130
+    assert len(list((out / "data").rglob("*.left.json"))) == 18
     record = json.loads((out / "onboarding.json").read_text())
     assert [name for name, one in record["stages"].items() if one["done"]] == [
         "mesh",

@@ -193,6 +193,11 @@ class PoseDataModule(LightningDataModule):
         if self.source == "scenes":
             ensure_scenes(self.root, self._generate)
 
+    def render(self) -> None:
+        """Render what the scenes lack, also of a dataset that was finished with fewer frames."""
+        if self._generate is not None:
+            self._generate(self.root)
+
     def setup(self, stage: str | None = None) -> None:
         """List, split and decode the frames that a stage needs."""
         for name in _STAGES[stage]:
