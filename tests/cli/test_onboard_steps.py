@@ -87,8 +87,8 @@ def rendering(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[float]:
     """Have a frame take half a second, a step 1 s and an image 0.5 s; return the clock [s]."""
     now = [0.0]
 
-    def build_data(data: DictConfig, console: str) -> None:
-        for i in range(command.count_frames(tmp_path / "data"), data.frames):
+    def render_scenes(job: SimpleNamespace) -> None:
+        for i in range(command.count_frames(tmp_path / "data"), job.cfg.data.frames):
             file = tmp_path / "data" / "mixed" / "scene0_0" / f"{i:06d}.left.json"
             file.parent.mkdir(parents=True, exist_ok=True)
             file.touch()
@@ -99,7 +99,7 @@ def rendering(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[float]:
         return SimpleNamespace(cfg=SimpleNamespace(data=data), folder=folder)
 
     monkeypatch.setattr("time.perf_counter", lambda: now[0])
-    monkeypatch.setattr(command, "build_data", build_data)
+    monkeypatch.setattr(command, "render_scenes", render_scenes)
     monkeypatch.setattr(command, "measure_speed", lambda job: Speed(step=1.0, image=0.5))
     monkeypatch.setattr(Onboarding, "job", make_job)
     return now
@@ -171,7 +171,7 @@ def test_what_is_left_of_a_rendering_that_was_interrupted_is_known(
         with pytest.raises(KeyboardInterrupt):
             work.stages.run(stage.name, work.settings_of(stage), lambda: stage.do(work))
     assert work.seconds_left == 3.5 * 60 - 200 * 0.5
-    monkeypatch.setattr(command, "build_data", lambda *_: None)  # interrupted before it goes on
+    monkeypatch.setattr(command, "render_scenes", lambda _: None)  # interrupted before it goes on
     command.render(work)
     work.stages.keep(seconds_per_frame=0.5)
     # 150 frames, the fewest steps, and what follows
