@@ -135,17 +135,23 @@ def simulate_gpu() -> Iterator[torch.device]:
 
 
 def compute_again(
-    function: Callable[..., Tensor], inputs: list[Tensor]
-) -> tuple[Callable[[], None], Tensor]:
+    function: Callable[..., Any], inputs: list[Tensor], generator: torch.Generator | None = None
+) -> tuple[Callable[[], None], Any]:
     """Stand in for `cuda_graphs.capture`: what is replayed is computed again, into one result."""
+    more = {} if generator is None else {"generator": generator}
     SimulatedGpu.records = True
     try:
-        output = function(*inputs)
+        output = function(*inputs, **more)
     finally:
         SimulatedGpu.records = False
 
     def replay() -> None:
-        output.copy_(function(*inputs))
+        found = function(*inputs, **more)
+        if isinstance(output, Tensor):
+            output.copy_(found)
+        else:
+            for old, new in zip(output, found, strict=True):
+                old.copy_(new)
 
     return replay, output
 

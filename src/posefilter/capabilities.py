@@ -37,6 +37,7 @@ MEANINGS: Mapping[str, str] = {
     "propose_poses": "a method that proposes poses",
     "ray_samples": "scored points along labeled rays",
     "objectness": "an objectness map of the image",
+    "recordable": "a component that a GPU can replay",
     "rollout": "training that rolls out the filter",
     "score_poses": "a method that scores any pose",
     "surface_point_loss": "a loss on each particle's predicted object point",

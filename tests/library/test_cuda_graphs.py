@@ -62,6 +62,31 @@ def test_recordings_are_told_apart_and_not_kept_for_ever() -> None:
     assert find(cuda_graphs.describe(a)) is not first
 
 
+def test_a_recording_draws_what_its_function_would_draw() -> None:
+    def work(a: Tensor, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+        drawn = torch.randn(3, generator=generator)
+        return a + drawn, drawn
+
+    record = cuda_graphs.Recording()
+    own, plain = torch.Generator().manual_seed(3), torch.Generator().manual_seed(3)
+    for number in range(5):
+        if number == 3:  # another generator, as of another image
+            own, plain = torch.Generator().manual_seed(8), torch.Generator().manual_seed(8)
+        a = torch.full((3,), float(number))
+        found, expected = record(work, a, generator=own), work(a, plain)
+        assert all(map(torch.equal, found, expected))
+        assert torch.equal(own.get_state(), plain.get_state())
+
+
+def test_tensors_of_inference_mode_are_always_read_anew() -> None:
+    record = cuda_graphs.Recording()
+    with torch.inference_mode():
+        kept = torch.ones(2)
+        for number in range(4):
+            kept.fill_(number)
+            assert record(torch.neg, kept)[0].item() == -number
+
+
 def test_a_cpu_records_nothing() -> None:
     with torch.no_grad():
         assert not cuda_graphs.applies(torch.zeros(2))

@@ -32,6 +32,8 @@ from typing import NamedTuple
 import torch
 from torch import Generator, Tensor, nn
 
+from posefilter import cuda_graphs
+from posefilter.capabilities import list_parts, read_declared
 from posefilter.errors import UserError
 from posefilter.filters.auxiliary import bind_to_encoding
 from posefilter.protocols import (
@@ -49,6 +51,7 @@ from posefilter.protocols import (
 from posefilter.types import Batch, ParticleOutput, Particles, Resampled, Step, Trace
 
 MAX_SEARCHES = 3  # of an image, where nothing else is set
+_find_recording = cuda_graphs.make_recordings()
 
 
 class Iteration(NamedTuple):
@@ -163,17 +166,14 @@ class ParticleFilter(nn.Module):
         ancestor_log_likelihood = torch.zeros_like(particles.log_weights)
         resample = bind_to_encoding(self.resample, encoding, batch)
         output: ParticleOutput | None = None
-        for number, sigma in enumerate(self.schedule(self.steps)):
-            step = Step(number, self.steps, state.new_tensor(sigma))
+        # one tensor: a GPU is waited for when it is sent one
+        for number, sigma in enumerate(state.new_tensor(self.schedule(self.steps))):
+            step = Step(number, self.steps, sigma)
             if output is not None:
-                resampled = resample(particles, self.particles, method.space, generator)
-                state = inherit(particles.state, resampled, method.space)
-                displacement = inherit(output.displacement, resampled)
-                state = self.propagate(state, displacement, step, method.space, generator)
-                latent = inherit(output.latent, resampled)
-                before = inherit(output.log_likelihood[..., None], resampled)
-                ancestor_log_likelihood = before[..., 0]
-                particles = Particles(state, latent, resampled.log_weights, resampled.ancestors)
+                *parts, ancestor_log_likelihood = self._advance(
+                    particles, output, step, resample, method.space, generator
+                )
+                particles = Particles(*parts)
             output = method.measure(encoding, particles, step, generator)
             log_weights = self.reweight(
                 particles.log_weights, output.log_likelihood, ancestor_log_likelihood
@@ -181,6 +181,45 @@ class ParticleFilter(nn.Module):
             increment = log_weights.logsumexp(1)
             particles = particles._replace(log_weights=log_weights - increment[:, None])
             yield Iteration(particles, output, step, increment)
+
+    def _advance(
+        self,
+        particles: Particles,
+        output: ParticleOutput,
+        step: Step,
+        resample: Resample,
+        space: Space,
+        generator: Generator,
+    ) -> tuple[Tensor, ...]:
+        """Resample and move particles.  -> the parts of `Particles`, and the log-likelihoods (B, N)
+        of their ancestors.
+
+        A GPU replays it, where its components can be recorded.
+        """
+
+        def work(*parts: Tensor, generator: Generator) -> tuple[Tensor, ...]:
+            state, log_weights, displacement, latent, log_likelihood, sigma = parts
+            own = particles._replace(state=state, log_weights=log_weights)
+            resampled = resample(own, self.particles, space, generator)
+            moved = self.propagate(
+                inherit(state, resampled, space),
+                inherit(displacement, resampled),
+                step._replace(sigma=sigma),
+                space,
+                generator,
+            )
+            latent = inherit(latent, resampled)
+            before = inherit(log_likelihood[..., None], resampled)[..., 0]
+            return moved, latent, resampled.log_weights, resampled.ancestors, before
+
+        parts = [particles.state, particles.log_weights, output.displacement, output.latent]
+        parts += [output.log_likelihood, step.sigma]
+        components = (resample, self.propagate)
+        if not (cuda_graphs.applies(*parts) and all(map(can_be_recorded, components))):
+            return work(*parts, generator=generator)
+        key = (self.particles, space, components, cuda_graphs.describe(*parts))
+        found: tuple[Tensor, ...] = _find_recording(key)(work, *parts, generator=generator)
+        return found
 
     def finish(
         self,
@@ -200,6 +239,15 @@ class ParticleFilter(nn.Module):
         belief = self.estimate(particles[-1], outputs[-1], encoding, method, generator)
         belief = self.refine(belief, encoding, method, generator)
         return Trace(particles, outputs, steps, belief, log_evidence, encoding)
+
+
+def can_be_recorded(component: object) -> bool:
+    """Return whether a GPU can replay what a component does, with all that it is made of."""
+    return all(
+        "recordable" in read_declared(type(part)).provides
+        for part in list_parts(component)
+        if callable(part)
+    )
 
 
 def make_particles(state: Tensor, latent_width: int) -> Particles:

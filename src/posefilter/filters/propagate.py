@@ -19,6 +19,8 @@ from posefilter.types import Step
 class Identity:
     """Leave every particle at its state."""
 
+    provides: ClassVar[Capabilities] = ("recordable",)
+
     def __call__(
         self, state: Tensor, displacement: Tensor, step: Step, space: Space, generator: Generator
     ) -> Tensor:
@@ -34,6 +36,8 @@ class Gaussian:
     Args:
         noise_scale: Standard deviation over the noise level.
     """
+
+    provides: ClassVar[Capabilities] = ("recordable",)
 
     def __init__(self, noise_scale: float = 0.4) -> None:
         self.noise_scale = noise_scale
@@ -53,6 +57,7 @@ class Gaussian:
 class LearnedDisplacement:
     """Move each particle by the displacement that the method's network predicts."""
 
+    provides: ClassVar[Capabilities] = ("recordable",)
     requires: ClassVar[Capabilities] = ("displacement",)
 
     def __call__(
@@ -71,6 +76,7 @@ class HalfTurnRotations:
         probability: Probability that a particle is rotated.
     """
 
+    provides: ClassVar[Capabilities] = ("recordable",)
     requires: ClassVar[Capabilities] = ("pose_space",)
 
     def __init__(self, probability: float = 0.1) -> None:
@@ -121,6 +127,8 @@ class AxisRotations:
 
 class Compose:
     """Apply several kernels one after the other."""
+
+    provides: ClassVar[Capabilities] = ("recordable",)  # if all of them are
 
     def __init__(self, components: Iterable[Propagate]) -> None:
         self.components = list(components)

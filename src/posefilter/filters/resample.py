@@ -7,10 +7,12 @@ Papaspiliopoulos (2020, chapter 9).
 """
 
 import math
+from typing import ClassVar
 
 import torch
 from torch import Generator, Tensor
 
+from posefilter.capabilities import Capabilities
 from posefilter.errors import UserError
 from posefilter.protocols import Resample, Space
 from posefilter.types import Particles, Resampled
@@ -41,6 +43,8 @@ class InverseCDF:
     Children have equal weights. There is no gradient in the weights, since the choice of an
     ancestor is discrete.
     """
+
+    provides: ClassVar[Capabilities] = ("recordable",)
 
     def __call__(
         self, particles: Particles, count: int, space: Space, generator: Generator

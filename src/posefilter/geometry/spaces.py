@@ -43,7 +43,7 @@ _find_recording = cuda_graphs.make_recordings()
 
 
 @lru_cache(maxsize=64)
-def _to_device(center: tuple[float, ...], dtype: torch.dtype, device: torch.device) -> Tensor:
+def to_device(center: tuple[float, ...], dtype: torch.dtype, device: torch.device) -> Tensor:
     """Return a point as a tensor, made once: a GPU is waited for when one is sent to it."""
     return torch.tensor(center, dtype=dtype, device=device)
 
@@ -87,7 +87,7 @@ class PoseSpace:
         """
         if fused_moves.applies(state, tangent):
             return fused_moves.move(state, tangent, self.center)
-        center = _to_device(self.center, state.dtype, state.device)
+        center = to_device(self.center, state.dtype, state.device)
         if not cuda_graphs.applies(state, tangent):
             return move_about(state, tangent, center)
         record = _find_recording(cuda_graphs.describe(state, tangent))

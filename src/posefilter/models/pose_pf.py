@@ -9,6 +9,7 @@ from torch import Generator, Tensor, nn
 from posefilter.capabilities import Capabilities
 from posefilter.data.absent import hide_annotation
 from posefilter.filters.traces import map_tensors
+from posefilter.geometry.spaces import to_device
 from posefilter.metrics.scores import InstanceErrors
 from posefilter.models.candidate_samplers import CandidateSampler
 from posefilter.models.pose_particles import PoseParticles, require_depth
@@ -245,7 +246,7 @@ class PosePF(PoseParticles):
         self.candidate_sampler.restore(checkpoint.get("candidate_sampler", {}))
 
     def _center(self) -> Tensor:
-        return self.object_model.center.to(self.device)
+        return to_device(self.space.center, self.object_model.center.dtype, self.device)
 
     def _score(
         self,

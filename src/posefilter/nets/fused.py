@@ -9,7 +9,10 @@ GPU as many as bound its memory.
 """
 
 import math
+import os
 from functools import lru_cache
+from importlib.util import find_spec
+from shutil import which
 from typing import TYPE_CHECKING, NamedTuple
 
 import torch
@@ -30,6 +33,8 @@ if TYPE_CHECKING:
 
 # points that the network takes at once
 PART, GPU_PART = 4096, 1 << 18
+# points from which a GPU's kernels are worth their seconds of compiling, and whose inputs they keep
+KERNEL_POINTS = 1 << 17, 1 << 24
 _LEAST = 1e-12  # added to the shares of fragments, so that their sum can be divided by
 
 
@@ -140,6 +145,13 @@ def score(
     """
     tables = _find_tables(likelihood, image)
     octaves = likelihood.octaves
+    count = poses.shape[0] * poses.shape[1] * noise.shape[2]
+    fits = dtype == torch.bfloat16 and KERNEL_POINTS[0] <= count <= KERNEL_POINTS[1]
+    if tables is not None and fits and has_kernels(poses.device):
+        scores, inside = _score_by_kernel(
+            likelihood, image, tables, poses, sigma, center, radius, noise, spread
+        )
+        return likelihood.pool(scores, inside, likelihood.level(sigma.reshape(1)), poses, center)
     inputs, cells, inside = _inputs(octaves, image, tables, poses, center, radius, noise, spread)
     if sigma.device.type == "cpu":  # a video asks at the same few noise levels in every frame
         weights = CACHE.get(
@@ -153,6 +165,55 @@ def score(
     context = None if tables is None else tables.smooth
     scores = weights.score(inputs.flatten(1), context, cells).view(inside.shape)
     return likelihood.pool(scores, inside, likelihood.level(sigma.reshape(1)), poses, center)
+
+
+@lru_cache(maxsize=8)
+def has_kernels(device: torch.device) -> bool:
+    """Return whether a device has kernels of its own (`nets/kernels.py`): a GPU that multiplies
+    bfloat16, where Triton and the C compiler that it needs are installed.
+    """
+    if device.type != "cuda" or torch.cuda.get_device_capability(device) < (8, 0):
+        return False
+    return find_spec("triton") is not None and bool(os.environ.get("CC") or which("gcc"))
+
+
+def _score_by_kernel(
+    likelihood: "PoseLikelihood",
+    image: "Pixels",
+    tables: Tables,
+    poses: Tensor,
+    sigma: Tensor,
+    center: Tensor,
+    radius: float,
+    noise: Tensor,
+    spread: float,
+) -> tuple[Tensor, Tensor]:
+    """Return the points' scores (B, N, P), and which lie in the frame; arguments as of `score`."""
+    from posefilter.nets import kernels  # Triton, where it is needed
+
+    assert image.context is not None
+    own = _Weights(likelihood, sigma, torch.float32)
+    layers = kernels.pack(own.enter, own.context, own.blocks, own.floor, own.leave)
+    about = image.context
+    scores, inside = kernels.score_points(
+        image.values,
+        image.size,
+        image.intrinsics,
+        tables.fragments,
+        tables.smooth,
+        about.centers,
+        about.grid,
+        about.columns,
+        STRIDE,
+        poses,
+        center,
+        radius,
+        noise,
+        spread,
+        likelihood.octaves,
+        layers,
+    )
+    return scores.add_(own.last), inside
 
 
 def _inputs(

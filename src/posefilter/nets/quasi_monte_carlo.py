@@ -1,5 +1,7 @@
 """Standard normal points of the plane that cover it more evenly than independent draws do."""
 
+from functools import lru_cache
+
 import torch
 from torch import Generator, Tensor
 
@@ -30,6 +32,14 @@ def draw_quasi_random(batch: int, count: int, generator: Generator, device: torc
         Niederreiter: Random number generation and quasi-Monte Carlo methods. SIAM (1992).
     """
     shift = torch.rand(batch, 1, 1, 2, generator=generator, device=device, dtype=torch.float64)
-    steps = torch.arange(count, device=device)[:, None] * shift.new_tensor(_STEP)
-    square = (steps + shift).frac()
+    square = (_list_steps(count, device) + shift).frac()
     return torch.special.ndtri(square.clamp(_EDGE, 1 - _EDGE)).float()
+
+
+@lru_cache(maxsize=32)
+def _list_steps(count: int, device: torch.device) -> Tensor:
+    """Return the sequence without its shift, (count, 2), made once: a GPU is waited for when it is
+    sent numbers.
+    """
+    step = torch.tensor(_STEP, dtype=torch.float64, device=device)
+    return torch.arange(count, device=device)[:, None] * step
