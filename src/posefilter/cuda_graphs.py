@@ -43,9 +43,8 @@ class Recording:
         self._inputs: list[Tensor] = []
         self._generator: Generator | None = None  # which the graph draws from
         self._output: Result = ()
-        self._given: list[
-            tuple[Tensor, float]
-        ] = []  # what was copied last, kept alive, and versions
+        # what was copied last, kept alive, and versions
+        self._given: list[tuple[Tensor, float]] = []
 
     def __call__(
         self, function: Function, *tensors: Tensor, generator: Generator | None = None

@@ -167,7 +167,7 @@ class ParticleFilter(nn.Module):
         resample = bind_to_encoding(self.resample, encoding, batch)
         output: ParticleOutput | None = None
         # one tensor: a GPU is waited for when it is sent one
-        for number, sigma in enumerate(state.new_tensor(self.schedule(self.steps))):
+        for number, sigma in enumerate(state.new_tensor([*self.schedule(self.steps)])):
             step = Step(number, self.steps, sigma)
             if output is not None:
                 *parts, ancestor_log_likelihood = self._advance(
@@ -199,7 +199,7 @@ class ParticleFilter(nn.Module):
 
         def work(*parts: Tensor, generator: Generator) -> tuple[Tensor, ...]:
             state, log_weights, displacement, latent, log_likelihood, sigma = parts
-            own = particles._replace(state=state, log_weights=log_weights)
+            own = particles._replace(state=state, log_weights=log_weights)  # all that these read
             resampled = resample(own, self.particles, space, generator)
             moved = self.propagate(
                 inherit(state, resampled, space),

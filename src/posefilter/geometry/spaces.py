@@ -4,7 +4,7 @@ A space perturbs, averages and compares states.
 """
 
 from dataclasses import dataclass, field
-from functools import cached_property, lru_cache
+from functools import cache, cached_property
 from typing import ClassVar
 
 import torch
@@ -42,7 +42,7 @@ class PixelSpace:
 _find_recording = cuda_graphs.make_recordings()
 
 
-@lru_cache(maxsize=64)
+@cache  # not forgotten: graphs of a GPU read them where they are
 def to_device(center: tuple[float, ...], dtype: torch.dtype, device: torch.device) -> Tensor:
     """Return a point as a tensor, made once: a GPU is waited for when one is sent to it."""
     return torch.tensor(center, dtype=dtype, device=device)
