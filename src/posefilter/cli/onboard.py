@@ -15,12 +15,12 @@ from omegaconf import DictConfig, OmegaConf
 
 from posefilter.callbacks.time_budget import TimeBudget
 from posefilter.cli.arguments import quote
-from posefilter.cli.build import build_data, make_data, without_bars
+from posefilter.cli.build import build_data
 from posefilter.cli.calibrate import learn
 from posefilter.cli.checkpoints import method_of, read_checkpoint
 from posefilter.cli.choices import check_choices
 from posefilter.cli.command import compose_job
-from posefilter.cli.console import JSON, ended, say, typed, typed_prediction, warn
+from posefilter.cli.console import ended, say, typed, typed_prediction, warn
 from posefilter.cli.export import strip, write_weights
 from posefilter.cli.files import save_whole
 from posefilter.cli.folders import hold_folder
@@ -339,8 +339,7 @@ def render_scenes(job: Job) -> None:
     """Render what the scenes of a job lack; those of a trial are fewer than those of the training
     that follows, in one folder.
     """
-    node = job.cfg.data
-    make_data(without_bars(node) if job.cfg.console == JSON else node).render()
+    build_data(job.cfg.data, job.cfg.console).render()
 
 
 def measure(work: Onboarding, job: Job, began: float) -> None:
