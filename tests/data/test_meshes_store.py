@@ -1,6 +1,8 @@
 """The mesh store: layouts, names, units, symmetries."""
 
 import json
+import logging
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -15,9 +17,18 @@ from posefilter.meshes.symmetries import rotation_about
 HALF = np.diag([-1.0, -1.0, 1.0, 1.0])  # half a turn about z
 
 
-def _box(path: Path, size: tuple[float, float, float] = (0.1, 0.2, 0.3)) -> Path:
+BOWL = np.linalg.inv(ycb.bop_from_original("024_bowl"))[:3, 3]  # the center of YCB's
+
+
+def _box(
+    path: Path,
+    size: tuple[float, float, float] = (0.1, 0.2, 0.3),
+    center: Sequence[float] = (0, 0, 0),
+) -> Path:
     path.parent.mkdir(parents=True, exist_ok=True)
-    trimesh.creation.box(size).export(path)
+    box = trimesh.creation.box(size)
+    box.apply_translation(center)
+    box.export(path)
     return path
 
 
@@ -124,7 +135,7 @@ def test_symmetries_come_from_the_argument_then_the_file_then_the_table(tmp_path
 
 
 def test_a_folder_of_its_own_may_say_its_symmetries(tmp_path: Path) -> None:
-    _box(tmp_path / "024_bowl" / "textured.obj")
+    _box(tmp_path / "024_bowl" / "textured.obj", center=BOWL)
     table = MeshStore(tmp_path).load("024_bowl").symmetries
     assert table == pytest.approx(ycb.symmetries("024_bowl"))
     own = {
@@ -142,11 +153,63 @@ def test_a_folder_of_its_own_may_say_its_symmetries(tmp_path: Path) -> None:
     assert np.array_equal(again, read)
 
 
+@pytest.mark.parametrize("name", ["024_bowl", "051_large_clamp", "061_foam_brick"])
+@pytest.mark.parametrize("frame", ["google_16k", "YCB-Video", "BOP"])
+def test_known_symmetries_follow_the_frame_of_the_mesh(
+    name: str, frame: str, tmp_path: Path
+) -> None:
+    """YCB-Video's and BOP's models are shifted against those that the table was measured on."""
+    moves = {
+        "google_16k": np.eye(4),
+        "YCB-Video": ycb.ycbvideo_from_original(name),
+        "BOP": ycb.bop_from_original(name),
+    }
+    to_bop = ycb.bop_from_original(name)  # in whose frame the box lies about the origin
+    place = moves[frame]
+    _box(tmp_path / name / "textured.obj", center=(place @ np.linalg.inv(to_bop))[:3, 3])
+    found = MeshStore(tmp_path).load(name).symmetries
+    table = ycb.symmetries(name)
+    assert table is not None
+    points = np.random.default_rng(0).normal(size=(4, 20))
+    points[3] = 1
+    for turn, known in zip(found, table, strict=True):
+        np.testing.assert_allclose(turn @ place @ points, place @ known @ points, atol=1e-12)
+
+
+def test_known_symmetries_and_parts_are_left_out_where_the_frame_is_unknown(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    _box(tmp_path / "051_large_clamp" / "textured.obj", center=(0.3, 0, 0))
+    _box(tmp_path / "003_cracker_box" / "textured.obj", center=(0.3, 0, 0))
+    with caplog.at_level(logging.WARNING):
+        store = MeshStore(tmp_path)
+        assert len(store.load("003_cracker_box").symmetries) == 1
+        assert caplog.messages == []  # it has none to leave out
+        assert len(store.load("051_large_clamp").symmetries) == 1
+        assert store.load("051_large_clamp").parts == {}
+    assert "its frame is none of those that YCB, YCB-Video and BOP have" in caplog.messages[0]
+
+
+@pytest.mark.parametrize("moved", [False, True])
+def test_known_parts_follow_the_frame_of_the_mesh(moved: bool, tmp_path: Path) -> None:
+    name = "051_large_clamp"
+    place = ycb.ycbvideo_from_original(name) if moved else np.eye(4)
+    center = (place @ np.linalg.inv(ycb.bop_from_original(name)))[:3, 3]
+    path = tmp_path / name / "textured.obj"
+    path.parent.mkdir(parents=True)
+    box = trimesh.creation.box((0.05, 0.2, 0.03)).subdivide_loop(4)
+    box.apply_translation(center - box.bounds.mean(axis=0))
+    box.export(path)
+    mesh = MeshStore(tmp_path).load(name)
+    low = mesh.vertices[mesh.faces[mesh.parts["handles"]]][..., 1].mean(axis=1).min()
+    assert low - place[1, 3] == pytest.approx(-0.013, abs=0.01)
+
+
 def test_a_file_about_other_objects_hides_no_table(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     for name in ("024_bowl", "my_can"):
-        _box(tmp_path / name / "textured.obj")
+        _box(tmp_path / name / "textured.obj", center=BOWL)
     turn = {"symmetries_continuous": [{"axis": [0, 0, 1]}]}
     (tmp_path / "symmetries.json").write_text(json.dumps({"my_can": turn}))
     half = {"symmetries_discrete": [HALF.reshape(-1).tolist()]}

@@ -276,3 +276,23 @@ def test_what_renders_nothing_needs_no_embree() -> None:
         "posefilter.cli.track"
     )
     subprocess.run([sys.executable, "-c", code], check=True)
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_a_long_object_near_the_camera_is_seen_whole(seed: int) -> None:
+    """Where its corners lie far outside of the image."""
+    draw = np.random.default_rng(seed)
+    sides = np.array([1.2, 0.03, 0.03])
+    whole = trimesh.creation.box(sides)
+    stick = plain("stick", np.asarray(whole.vertices), np.asarray(whole.faces))
+    T = np.eye(4)
+    corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]) * sides / 2
+    while True:
+        T[:3, :3] = Rotation.random(random_state=draw).as_matrix()
+        T[:3, 3] = [*draw.uniform(-0.05, 0.05, 2), draw.uniform(0.1, 0.4)]
+        near = (corners @ T[:3, :3].T + T[:3, 3])[:, 2].min()
+        exact = exact_box(K, T, sides)
+        if 0.03 < near < 0.1 and (exact > 0).mean() > 0.05:
+            break
+    depth, _ = render_depth([stick], [T], K, H, W)
+    assert (depth > 0).mean() == pytest.approx((exact > 0).mean(), abs=0.01)

@@ -44,7 +44,8 @@ class PointToPlaneIcp:
 
     Args:
         iterations: Gauss-Newton steps.
-        initial_gate: Distance beyond which a pair does not count in the first step [m].
+        initial_gate: Distance along the measured normal beyond which a pair does not count in the
+            first step [m]; in all, its points may be 2.5 times as far apart.
         final_gate: In the last step; geometric between.
         prior: Standard deviation of the estimate before [m on the object's surface].
         noise: Standard deviation of a distance along the normal [m].

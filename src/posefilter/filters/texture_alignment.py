@@ -69,7 +69,8 @@ class TextureAlignment:
         texture_error: Standard deviation of the shift of a side's print [m].
         min_gain: By which the evidence of the print must rise for the estimate to be moved [nat],
             see `measure_texture`.
-        gate: Distance beyond which a measured point is not the surface point's [m].
+        gate: Distance along the measured normal beyond which a measured point is not the surface
+            point's [m]; in all, it may be 2.5 times as far away.
         noise: Standard deviation of a measured distance along the normal [m].
         effective: Surface points count as this many independent ones at most.
         points: Surface points at most, for the depth.

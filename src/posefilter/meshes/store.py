@@ -1,6 +1,7 @@
 """Meshes by name: of a folder (YCB's layout, BOP's models, or any files), or the built-in ones."""
 
 import difflib
+import logging
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -18,6 +19,8 @@ from posefilter.meshes.parts import FILE, declares_parts, read_parts, split_part
 from posefilter.meshes.symmetries import declares, identity_first, read_symmetries, symmetry_group
 
 __all__ = ["Mesh", "MeshStore", "object_model", "symmetry_group"]
+
+log = logging.getLogger(__name__)
 
 # [m] the unit of an object that is larger or smaller must be wrong
 LARGEST, SMALLEST = 10.0, 1e-3
@@ -118,7 +121,7 @@ class MeshStore:
             mesh = read_mesh(self._files[name], name, self.scale)
             _check_unit(mesh, self._files[name], self.scale)
             mesh = replace(mesh, parts=self._parts(name, mesh))
-        symmetries = self._symmetries(name)
+        symmetries = self._symmetries(name, mesh)
         return mesh if symmetries is None else replace(mesh, symmetries=symmetries)
 
     def has(self, name: str) -> bool:
@@ -145,14 +148,32 @@ class MeshStore:
         for folder in self._folders_of(name):
             if (folder / FILE).is_file() and declares_parts(folder / FILE, name):
                 return read_parts(folder / FILE, name, self.scale, mesh)
-        return ycb.parts(name, mesh)
+        place = self._find_ycb_frame(name, mesh)
+        if place is None:
+            return {}
+        return ycb.parts(name, replace(mesh, vertices=mesh.vertices - place[:3, 3]))
+
+    def _find_ycb_frame(self, name: str, mesh: Mesh) -> np.ndarray | None:
+        """Return the transform from the frame in which a class's symmetries and parts are known to
+        a mesh's, (4, 4) [m]; None where it is not known, which the log says if it matters.
+        """
+        place = ycb.mesh_from_original(name, mesh)
+        if place is None and (name in ycb.TOOLS or ycb.symmetries(name) is not None):
+            log.warning(
+                "%s: its frame is none of those that YCB, YCB-Video and BOP have for %s, so the "
+                "known symmetries and parts are left out; declare them in symmetries.json and "
+                "parts.json beside it",
+                self._files[name],
+                name,
+            )
+        return place
 
     def _folders_of(self, name: str) -> list[Path]:
         """Return where files beside a mesh are looked for, nearest first."""
         file = self._files[name]
         return list(dict.fromkeys([file.parent, Path(self.root) / name, Path(self.root)]))
 
-    def _symmetries(self, name: str) -> np.ndarray | None:
+    def _symmetries(self, name: str, mesh: Mesh) -> np.ndarray | None:
         """Return the declared symmetries, None where there are none but the mesh's own."""
         if name in self._given:
             return identity_first(
@@ -164,7 +185,9 @@ class MeshStore:
             for info in (folder / "symmetries.json", folder / "models_info.json"):
                 if info.is_file() and declares(info, name):
                     return read_symmetries(info, name, self.scale, self.symmetry_steps)
-        return ycb.symmetries(name, self.symmetry_steps)
+        turns = ycb.symmetries(name, self.symmetry_steps)
+        place = None if turns is None else self._find_ycb_frame(name, mesh)
+        return None if place is None else place @ turns @ np.linalg.inv(place)
 
 
 def _find_meshes(root: Path) -> tuple[dict[str, Path], dict[str, str]]:

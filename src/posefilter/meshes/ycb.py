@@ -44,6 +44,9 @@ _FRAMES = {
     "061_foam_brick": ((0.018448, -0.017271, -0.016884), (8e-05, -8e-05, 0.00824)),
 }
 CLASSES = tuple(_FRAMES)
+# [m], between the center of a mesh's bounding box and the class's: google_16k's are within 0.5 mm,
+# and no two frames of a class are closer than 18 mm.
+_NEAR = 0.009
 WITHOUT_GEOMETRY = frozenset(name for name, frames in _FRAMES.items() if frames is None)
 
 # Declared symmetries, for training and labels only: ADD and ADD-S as published ignore them.
@@ -80,6 +83,7 @@ _PARTS = {
     "051_large_clamp": {"jaws": (1, -1.0, -0.013), "handles": (1, -0.013, 1.0)},
     "052_extra_large_clamp": {"jaws": (0, -1.0, -0.027), "handles": (0, -0.027, 1.0)},
 }
+TOOLS = tuple(_PARTS)
 
 
 def parts(name: str, mesh: Mesh) -> dict[str, np.ndarray]:
@@ -144,6 +148,24 @@ def _find_frames(name: str) -> tuple[tuple[float, float, float], tuple[float, fl
     if frames is None:
         raise KeyError(name)
     return frames
+
+
+def mesh_from_original(name: str, mesh: Mesh) -> np.ndarray | None:
+    """Return the transform (4, 4) [m] from the frame of the google_16k mesh to that of a mesh of
+    the same class: the identity, or that of YCB-Video's or BOP's models, by where the bounding box
+    lies; None if it is neither, or the relation of the frames is not known.
+    """
+    center = mesh.bounds.mean(axis=0)
+    frames = _FRAMES.get(name)
+    if frames is None:  # symmetries leave the center of their own mesh where it is
+        turns = symmetries(name)
+        moved = 0.0 if turns is None else turns[:, :3, :3] @ center + turns[:, :3, 3] - center
+        return np.eye(4) if np.abs(moved).max() < _NEAR else None
+    shift, middle = map(np.array, frames)
+    places = (np.zeros(3), shift, shift - middle)
+    off = [float(np.linalg.norm(center - (middle - shift + place))) for place in places]
+    best = int(np.argmin(off))
+    return rigid(np.eye(3), places[best]) if off[best] < _NEAR else None
 
 
 def symmetries(name: str, steps: int = 36) -> np.ndarray | None:

@@ -98,11 +98,13 @@ def covered_pixels(points: np.ndarray, K: np.ndarray, shape: tuple[int, ...]) ->
     if (points[:, 2] < NEAR).any():
         return np.arange(height * width)
     pixels = project(points, K)
-    pixels = np.clip(pixels, [-4.0 * width, -4.0 * height], [5.0 * width, 5.0 * height])
     low = np.maximum(np.floor(pixels.min(0)).astype(int) - 2, 0)
     high = np.minimum(np.ceil(pixels.max(0)).astype(int) + 3, [width, height])
     if (high <= low).any():
         return np.zeros(0, np.int64)
+    if (np.abs(pixels) > 5 * max(width, height)).any():
+        # beyond what can be drawn; corners moved one by one would turn the outline
+        return np.arange(height * width)
     outline = cv2.convexHull(np.round((pixels - low) * 16).astype(np.int32))
     mask = np.zeros((high[1] - low[1], high[0] - low[0]), np.uint8)
     cv2.fillConvexPoly(mask, outline, 1, shift=4)
