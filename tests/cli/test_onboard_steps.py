@@ -214,6 +214,8 @@ def test_another_texture_mapping_is_another_mesh(tmp_path: Path) -> None:
         ("filter/resample=below_ess", "is now filter/resample=adaptive"),
         ("trainer.max_steps=300", "steps= sets the number"),
         ("+trainer.val_check_interval=5", "trainer.val_check_interval follows from"),
+        ("data.generate.frames=3000", "data.generate.frames is frames= of this command"),
+        ("data.limit_test=20", "data.limit_test is test_frames= of this command"),
         ("filter.partcles=20", "filter.partcles: there is no such setting"),
         ("filter.partcles=${filter.steps}", "filter.partcles: there is no such setting"),
     ],
@@ -248,6 +250,67 @@ def test_other_symmetries_are_refused_before_they_replace_those_of_the_training(
     assert file.read_text() == before
     assert run_command("onboard", arguments=typed) == 2
     assert capfd.readouterr().err.splitlines()[-1].endswith("stopped here")
+
+
+def test_a_training_that_was_refused_before_it_began_may_have_other_settings(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """The renders are kept; once there is a checkpoint, other settings would spoil it."""
+    typed = ["mesh=banana", f"out={tmp_path / 'out'}", "console=json"]
+    rendered = []
+
+    def refuse(work: Onboarding) -> None:
+        if work.cfg.train_overrides:
+            raise UserError("refused here")
+        checkpoints = work.training / "checkpoints"
+        checkpoints.mkdir(parents=True)
+        (checkpoints / "last.ckpt").touch()
+        raise UserError("interrupted here")
+
+    quick = {"mesh": command.store_meshes, "symmetries": command.use_symmetries, "train": refuse}
+    quick["render"] = lambda work: rendered.append(work.frames)
+    stages = [stage._replace(do=quick.get(stage.name, lambda work: None)) for stage in STAGES]
+    monkeypatch.setattr(command, "STAGES", stages)
+    said = []
+    for more in (["filter.particles=20"], [], ["filter.particles=30"]):
+        assert run_command("onboard", arguments=[*typed, f"train_overrides={more}"]) == 2
+        said.append(capfd.readouterr().err.splitlines()[-1])
+    assert said[0].endswith("refused here")
+    assert said[1].endswith("interrupted here")
+    assert "'train' was begun with other settings (train_overrides)" in said[2]
+    assert len(rendered) == 1
+
+
+def test_the_users_own_files_are_not_overwritten(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "meshes" / "banana").mkdir(parents=True)
+    own = tmp_path / "meshes" / "banana" / "symmetries.json"
+    own.write_text("{}")
+    assert run_command("onboard", arguments=["mesh=banana", f"out={tmp_path}"]) == 2
+    assert "meshes: is no onboarding's, and would be" in capfd.readouterr().err
+    Stages(tmp_path / "onboarding.json").keep()  # now it is
+    given = ["mesh=banana", f"out={tmp_path}", f"symmetries={own}"]
+    assert run_command("onboard", arguments=given) == 2
+    assert "is written by this command" in capfd.readouterr().err
+    assert own.read_text() == "{}"
+
+
+def test_what_is_told_at_the_end_is_of_its_own_test(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """A user may have evaluated in the training's folder since."""
+    training = tmp_path / "training"
+    training.mkdir()
+    scores = {"add": {}, "add_s": {}, "mssd": {}, "mspd": {}}
+    own = {**scores, "add": {"auc": 93.0}}
+    other = {**scores, "add": {"auc": 5.0}, "command": "evaluate"}
+    (training / "metrics_train.json").write_text(json.dumps(own))
+    (training / "metrics.json").write_text(json.dumps(other))
+    cfg = OmegaConf.create({"console": "json"})
+    work = Onboarding(cfg, build("banana"), tmp_path, Stages(tmp_path / "record.json"))
+    command.tell(work)
+    assert json.loads(capfd.readouterr().out.splitlines()[-1])["add"] == {"auc": 93.0}
 
 
 def test_a_folder_may_have_any_name(tmp_path: Path) -> None:

@@ -1,5 +1,6 @@
 """Which jobs of a sweep learn the same."""
 
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -7,8 +8,11 @@ import pytest
 import torch
 
 from posefilter.cli import reuse
+from posefilter.cli.checkpoints import recipe
 from posefilter.cli.command import compose_job
-from posefilter.cli.reuse import learned_from, take_over
+from posefilter.cli.job import Job
+from posefilter.cli.reuse import learned_from, start_from, take_over
+from posefilter.errors import UserError
 
 CONF = Path(__file__).parents[2] / "conf"
 
@@ -38,6 +42,23 @@ def test_training_is_shared_where_no_setting_of_it_differs(
     one = compose_job("train", CONF, common, tmp_path / "one")
     other = compose_job("train", CONF, [*common, *changed], tmp_path / "other")
     assert (learned_from(one) == learned_from(other)) == same
+
+
+def test_an_interrupted_training_goes_on_where_only_its_test_is_another(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def make_job(*words: str) -> Job:
+        return replace(compose_job("train", CONF, list(words), tmp_path), swept=True)
+
+    (tmp_path / "checkpoints").mkdir()
+    begun = make_job("data.limit_test=60")
+    checkpoint = {"recipe": recipe(begun), "global_step": 7}
+    (tmp_path / "checkpoints" / "last.ckpt").touch()
+    monkeypatch.setattr(reuse, "read_checkpoint", lambda file: checkpoint)
+    assert start_from(begun)[1] == 7
+    assert start_from(make_job("data.limit_test=30"))[1] == 7
+    with pytest.raises(UserError, match=r"data\.limit_train"):
+        start_from(make_job("data.limit_train=9"))
 
 
 def test_what_another_job_has_learned_comes_without_its_calibration(

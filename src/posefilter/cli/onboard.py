@@ -23,7 +23,7 @@ from posefilter.cli.command import compose_job
 from posefilter.cli.console import ended, say, typed, typed_prediction, warn
 from posefilter.cli.export import strip, write_weights
 from posefilter.cli.files import save_whole
-from posefilter.cli.folders import hold_folder
+from posefilter.cli.folders import hold_folder, move_evaluation, own_metrics
 from posefilter.cli.job import Job, write_job
 from posefilter.cli.machine import settle
 from posefilter.cli.measure_speed import Speed, measure_speed
@@ -43,7 +43,7 @@ from posefilter.meshes.inspect_mesh import list_concerns
 from posefilter.meshes.mesh import Mesh
 from posefilter.paths import find_conf
 from posefilter.report.diagnostics import format_duration
-from posefilter.report.gather import read_json, read_run
+from posefilter.report.gather import read_run
 from posefilter.report.onboarding_page import make_onboarding_page
 
 RECORD = "onboarding.json"
@@ -58,6 +58,12 @@ _VALIDATED = 8  # images, once at the end
 _CALIBRATED = 40  # images with the object, and as many without
 _POINTS = 2000  # of the surface, as the shipped files have: the alignment with the depth uses them
 _REST = 25.0  # [s] reserved for figures, weights and report
+_OWN = {
+    "data.generate.frames": "frames",
+    "data.generate.seed": "seed",
+    "data.limit_test": "test_frames",
+    "seed": "seed",
+}
 # The learning rate keeps pace with the clock, so that a training of too many steps ends in time,
 # and one of too few leaves time unused. So steps are hoped to be shorter than the measured one, and
 # never taken for longer than this, however busy the machine was then [s].
@@ -247,6 +253,18 @@ class Onboarding:
         seconds = speed.image * sum(images.get(name, 0) for name in ahead)
         return float(seconds + (_REST if ahead else 0.0))
 
+    @property
+    def has_checkpoint(self) -> bool:
+        """Whether the training has come to a checkpoint."""
+        return any((self.training / "checkpoints").glob("*.ckpt"))
+
+    def is_costly(self, stage: Stage) -> bool:
+        """Tell whether other settings would spoil what a stage has made: a training that was
+        refused before its first checkpoint has made nothing.
+        """
+        made = stage.name != "train" or self.has_checkpoint or self.stages.was_finished("train")
+        return stage.costly and made
+
     def is_done(self, stage: Stage) -> bool:
         """Tell whether a stage was finished, with the settings that it would have now."""
         return self.stages.is_done(stage.name, self.settings_of(stage))
@@ -263,17 +281,22 @@ def onboard(job: Job) -> None:
                 raise UserError(
                     f"train_overrides: {key} follows from budget_minutes; steps= sets the number"
                 )
+        for key, own in _OWN.items():  # which all stages reckon with
+            if key in map(key_of, overrides):
+                raise UserError(f"train_overrides: {key} is {own}= of this command")
         check_choices(overrides, find_conf(), "train")
         compose_job("train", find_conf(), overrides, Path())
     mesh = read_onboarded(cfg)
     out = Path(str(cfg.out)) if cfg.out else Path("outputs") / "onboard" / mesh.name
     hold_folder(out)
+    check_folder(out, str(cfg.symmetries), mesh.name)
     work = Onboarding(cfg, mesh, out, Stages(out / RECORD, FOUND))
     for stage in STAGES:  # before anything of an earlier run is overwritten
-        if stage.costly:
+        if work.is_costly(stage):
             work.stages.check(stage.name, work.settings_of(stage))
     begun = {stage.name: stage for stage in STAGES if stage.name in work.stages.seconds}
-    if "train" in begun:  # which learns from the symmetries that the stage before it wrote
+    # a training learns from the symmetries that the stage before it wrote
+    if "train" in begun and work.is_costly(begun["train"]):
         work.stages.check("symmetries", work.settings_of(begun["symmetries"]))
     for number, stage in enumerate(STAGES, 1):
         head = f"[{number}/{len(STAGES)}] {stage.doing}"
@@ -287,8 +310,28 @@ def onboard(job: Job) -> None:
             head += f"; about {duration} left" if known else f"; {duration} of the budget left"
         say(cfg.console, "stage", head, stage=stage.name, done=False, seconds_left=left)
         doing = partial(stage.do, work)
-        work.stages.run(stage.name, work.settings_of(stage), doing, stage.costly)
+        work.stages.run(stage.name, work.settings_of(stage), doing, work.is_costly(stage))
     tell(work)
+
+
+def check_folder(out: Path, symmetries: str, name: str) -> None:
+    """Refuse a folder in which files of the user would be overwritten.
+
+    Raises:
+        UserError: It has meshes that no onboarding wrote, or the symmetries that are given are a
+            file which this command writes.
+    """
+    meshes = out / "meshes"
+    if meshes.exists() and not (out / RECORD).is_file():
+        raise UserError(
+            f"{meshes}: is no onboarding's, and would be overwritten; choose another out="
+        )
+    own = meshes / name / "symmetries.json"
+    if own.exists() and Path(symmetries).exists() and own.samefile(symmetries):
+        raise UserError(
+            f"symmetries={symmetries}: is written by this command, in meters; give a copy of it "
+            "elsewhere, in the unit of the mesh"
+        )
 
 
 def store_meshes(work: Onboarding) -> None:
@@ -374,6 +417,8 @@ def measure(work: Onboarding, job: Job, began: float) -> None:
 def train(work: Onboarding) -> None:
     """Train for as many steps as fit, from where it was interrupted if it was."""
     values, console = work.stages.values, work.cfg.console
+    if not work.has_checkpoint:
+        values.pop("steps", None)  # of a start that came to nothing, maybe with other settings
     if values.get("steps") is None:
         began = time.perf_counter()
         if work.speed is None:  # rendered by an earlier version, or other settings since
@@ -441,6 +486,7 @@ def calibrate(work: Onboarding) -> None:
 
 def evaluate(work: Onboarding) -> None:
     """Test the weights on held-out renders, with the second look that their calibration allows."""
+    move_evaluation(work.training)  # which a user made in that folder
     training = {**work.stages.values["training"], "tested_step": step_of(work.run.best)}
     results = test(work.run, read_checkpoint(work.weights))
     finish(work.run, training, results, work.weights)
@@ -462,7 +508,7 @@ def report(work: Onboarding) -> None:
 
 def tell(work: Onboarding) -> None:
     """Say what came of it."""
-    metrics = read_json(work.training / "metrics.json")
+    metrics = own_metrics(work.training)
     minutes = {name: s / 60 for name, s in work.stages.seconds.items()}
     files = {
         "weights": work.weights,

@@ -118,6 +118,7 @@ def start_from(job: Job) -> tuple[Path | None, int]:
         say(job.cfg.console, "fallback", sentence, broken=last, checkpoint=before[0])
         last, checkpoint = before[0], read_checkpoint(before[0])
     changed = [] if job.cfg.resume else differing(checkpoint["recipe"], recipe(job))
+    changed = [key for key in changed if key not in {f"data.{name}" for name in _TESTED_WITH}]
     if changed:
         raise UserError(
             f"{job.folder}: holds a run that was cut short, with other settings than now "

@@ -61,6 +61,10 @@ class Stages:
         one = self._stages.get(name)
         return bool(one and one.get("done") and not _differing(one["settings"], settings))
 
+    def was_finished(self, name: str) -> bool:
+        """Tell whether a stage was finished, with whatever settings."""
+        return bool(self._stages.get(name, {}).get("done"))
+
     def check(self, name: str, settings: Mapping[str, Any]) -> None:
         """Refuse settings that differ from those that a costly stage was begun with.
 
