@@ -5,6 +5,7 @@ that grow, whose content so far survives.
 import errno
 import io
 import os
+import threading
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
@@ -35,7 +36,8 @@ def open_whole(path: Path, sync: bool = True) -> Iterator[BinaryIO]:
     Raises:
         UserError: It cannot be written, as on a full disk.  What had the name before still has it.
     """
-    part = path.with_name(f".{path.name}.{os.getpid()}.part")
+    # of its own for each thread: two may write one file, as a cache's do
+    part = path.with_name(f".{path.name}.{os.getpid()}.{threading.get_ident()}.part")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         with part.open("wb") as file:

@@ -6,7 +6,9 @@ import os
 import resource
 import shutil
 import signal
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from threading import Barrier
 
 import pytest
 import torch
@@ -100,6 +102,20 @@ def test_what_cannot_be_written_whole_leaves_what_was_there(tmp_path: Path) -> N
     os.waitpid(number, 0)
     assert torch.load(file, weights_only=True)["weight"].tolist() == [1, 1, 1]
     assert [path.name for path in tmp_path.iterdir()] == ["last.ckpt"]
+
+
+def test_two_threads_may_write_one_file(tmp_path: Path) -> None:
+    together = Barrier(2)
+
+    def write(content: bytes) -> None:
+        with open_whole(tmp_path / "a") as file:
+            file.write(content)
+            together.wait(20)  # both are open
+
+    with ThreadPoolExecutor(2) as pool:
+        list(pool.map(write, [b"one", b"two"]))  # which raises what a thread has raised
+    assert (tmp_path / "a").read_bytes() in (b"one", b"two")
+    assert [path.name for path in tmp_path.iterdir()] == ["a"]
 
 
 def test_a_file_that_was_given_up_leaves_nothing(tmp_path: Path) -> None:

@@ -1,12 +1,14 @@
 """Scenes that a run has learned from are not tested on unawares."""
 
 import json
+import logging
 from pathlib import Path
 
 import pytest
 from tests.data.dataset_trees import bop_scene, pose
 
 from posefilter.cli import run_command
+from posefilter.cli.evaluate import warn_of_learned
 from posefilter.cli.learned import list_learned
 from posefilter.cli.train import check_scenes
 from posefilter.data.module import PoseDataModule
@@ -49,6 +51,46 @@ def test_scenes_that_are_added_move_others_and_that_is_told(root: Path, tmp_path
     assert learned  # else nothing was shown
     with pytest.raises(UserError, match=rf"{len(learned)} that it learned from would be tested on"):
         check_scenes(record, after)
+
+
+def test_what_is_calibrated_on_was_not_learned(root: Path, tmp_path: Path) -> None:
+    """That a checkpoint was chosen by a scene does no harm here; that it was learned does."""
+    record = tmp_path / "data.json"
+    shares = {"train": 0.5, "val": 0.4, "test": 0.1}
+    before = write_record(record, open_data(root, shares))
+    assert list_learned(record, open_data(root, shares), "val") == []
+    moved = {"train": before["val"], "val": before["train"], "test": before["test"]}
+    assert find_learned(before, moved, "val") == sorted(before["train"])
+    tested = {"val": before["test"], "test": before["val"]}
+    assert find_learned(before, tested, "val") == []
+    for scene in range(10, 14):
+        bop_scene(root / f"{scene:06d}", [[(2, pose())]])
+    after = open_data(root, shares)
+    learned = list_learned(record, after, "val")
+    assert learned == sorted({*before["train"]} & {*after.split_record()["val"]})
+    assert learned  # else nothing was shown
+
+
+@pytest.mark.parametrize("named", ["run", "run/checkpoints/best.ckpt"])
+def test_an_evaluation_warns_whether_a_run_or_its_checkpoint_is_named(
+    named: str, root: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "run" / "checkpoints").mkdir(parents=True)
+    (tmp_path / "run" / "checkpoints" / "best.ckpt").touch()
+    write_record(tmp_path / "run" / "data.json", open_data(root))
+    warn_of_learned(str(tmp_path / named), open_data(root, {"test": 1.0}), "rich")
+    assert "were learned from by this run" in capfd.readouterr().out
+
+
+def test_the_log_has_what_a_reader_notes_once(root: Path, caplog: pytest.LogCaptureFixture) -> None:
+    data = open_data(root)
+    with caplog.at_level(logging.WARNING):
+        data.setup("validate")
+        data.reader.notes["masks are split by geometry"] += 3
+        data.setup("test")
+        data.setup("test")
+    noted = [text for text in caplog.messages if "by geometry" in text]
+    assert noted == ["masks are split by geometry (3)"]
 
 
 def test_a_test_of_everything_tests_what_was_learned(root: Path, tmp_path: Path) -> None:

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from tests.data.dataset_trees import bop_scene, pose
 
 from posefilter.data.absent import find_absent, hide_annotation
 from posefilter.data.frames import FrameRecord
@@ -88,6 +89,15 @@ def test_the_dataset_tells_them_apart(scenes: Path) -> None:
     assert len({*seen}) == len(seen)  # none in two splits
     part = max(("val", "test"), key=lambda part: len(data.absent_dataset(part)))
     assert len(data.absent_dataset(part, 1)) == 1
+
+
+def test_a_dataset_may_lack_the_object_altogether(tmp_path: Path) -> None:
+    bop_scene(tmp_path / "000001", [[(2, pose())], [(2, pose())]])
+    split = {"val": 1.0}
+    data = PoseDataModule("bop", tmp_path, "obj_000001", split=split, workers=0, progress=False)
+    assert len(data.absent_dataset("val")) == 2
+    own = PoseDataModule("bop", tmp_path, "obj_000002", split=split, workers=0, progress=False)
+    assert len(own.absent_dataset("val")) == 0
 
 
 def test_an_image_counts_once_and_only_where_the_object_is_not_listed() -> None:

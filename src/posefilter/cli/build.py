@@ -51,6 +51,7 @@ def build_data(node: DictConfig, console: str, overrides: Sequence[str] = ()) ->
     if node.get("generate"):
         settings = {k: v for k, v in resolve(node.generate).items() if not k.startswith("_")}
         _check_rendered(data.root, settings, overrides)
+        _check_mesh(data)
     return data
 
 
@@ -78,6 +79,19 @@ def _check_rendered(root: Path, settings: Mapping[str, Any], overrides: Sequence
             f"data.generate.{', '.join(changed)}: the scenes in {root} were rendered with another "
             "value, and are not rendered anew; name a folder of their own, data.root=DIR"
         )
+
+
+def _check_mesh(data: PoseDataModule) -> None:
+    """Refuse scenes that show another mesh than the one that would be learned."""
+    from posefilter.synthetic.generate import shows_another_mesh
+
+    for name in data.objects:
+        if shows_another_mesh(data.root, data.meshes, name):
+            raise UserError(
+                f"{data.root}: its scenes show another mesh of {name} than data.meshes="
+                f"{data.meshes.root} has now; name a folder of their own, data.root=DIR, or keep "
+                "the scenes as they are, data.generate=null"
+            )
 
 
 def without_bars(node: DictConfig) -> DictConfig:

@@ -15,7 +15,7 @@ from posefilter.callbacks.errors import ErrorTable, make_rows
 from posefilter.callbacks.records import Records, to_rows, write_beliefs
 from posefilter.cli.bop_scores import assign_estimates, score_targets, sort_rows
 from posefilter.cli.build import build_data, make_trainer, quiet
-from posefilter.cli.checkpoints import method_of, read_checkpoint
+from posefilter.cli.checkpoints import find_checkpoint, method_of, read_checkpoint
 from posefilter.cli.components import changed, changes, chosen
 from posefilter.cli.console import typed, warn
 from posefilter.cli.folders import keep_training_results, read_results
@@ -125,7 +125,7 @@ def _of_checkpoint(job: Job) -> tuple[dict[str, Any], dict[str, Path]]:
 
 def warn_of_learned(checkpoint: str, data: PoseDataModule, console: str) -> None:
     """Say where test scenes are of those that the checkpoint's run has learned from."""
-    learned = list_learned(Path(checkpoint).parent.parent / DATA, data)
+    learned = list_learned(find_checkpoint(checkpoint).parent.parent / DATA, data)
     if learned:
         sentence = (
             f"{len(learned)} of the scenes that are tested were learned from by this run "

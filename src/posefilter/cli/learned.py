@@ -9,12 +9,13 @@ from posefilter.limits import read_json
 DATA = "data.json"  # of a run: how its data were divided
 
 
-def list_learned(record: Path, data: PoseDataModule) -> list[str]:
-    """Return the scenes of the test split that a run has learned from, and did not test on.
+def list_learned(record: Path, data: PoseDataModule, part: str = "test") -> list[str]:
+    """Return the scenes of a part that a run has learned from, and did not have in that part.
 
     Args:
         record: Its data.json; there may be none.
         data: What is tested; another dataset than the run's has none of its scenes.
+        part: `test`, or `val` for what is calibrated on.
     """
     before = read_json(record) if record.is_file() else None
     if not isinstance(before, dict) or Path(str(before.get("root"))).resolve() != (
@@ -24,4 +25,4 @@ def list_learned(record: Path, data: PoseDataModule) -> list[str]:
     split = before.get("split")
     if not isinstance(split, dict) or not all(isinstance(part, dict) for part in split.values()):
         return []
-    return find_learned(split, data.split_record())
+    return find_learned(split, data.split_record(), part)

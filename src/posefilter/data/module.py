@@ -133,6 +133,7 @@ class PoseDataModule(LightningDataModule):
         self._texture_points = texture_points
         self._progress = progress
         self._datasets: dict[str, FrameDataset] = {}
+        self._noted = set[str]()  # what the log has of the reader's notes
         self._left_out: dict[str, Counter[str]] = {}
 
     @cached_property
@@ -204,6 +205,10 @@ class PoseDataModule(LightningDataModule):
             if name not in self._datasets:
                 self._datasets[name] = self._prepare(name)
                 log.info("%s", self._summarize(name))
+        for note, count in self.reader.notes.items():
+            if note not in self._noted:
+                log.warning("%s%s", note, f" ({count})" if count > 1 else "")
+                self._noted.add(note)
 
     def object_model(self, object_id: int) -> ObjectModel:
         """Return a class as methods and metrics use it.
@@ -273,8 +278,15 @@ class PoseDataModule(LightningDataModule):
         """
         reader = open_reader(self.source, self.root, None, None, "skip", **self._options)
         records = reader.records()
-        scenes = self.split_record() if self._records else {name: {} for name in NAMES}
-        found = find_absent(records, self._records, scenes, split, self.objects[0])
+        name = self._object if isinstance(self._object, str) else self.objects[0]
+        try:
+            own = self._records
+        except UserError:
+            if name in reader.objects:
+                raise
+            own = []  # no image of this dataset shows it
+        scenes = self.split_record() if own else {part: {} for part in NAMES}
+        found = find_absent(records, own, scenes, split, name)
         order = np.random.default_rng([self._split_seed, 11]).permutation(len(found))
         keep = partial(open_cache, "memory", Path(), "")
         decoder = self._make_decoder(reader, records, keep)

@@ -91,17 +91,23 @@ def split_records(
 
 
 def find_learned(
-    before: Mapping[str, Mapping[str, int]], after: Mapping[str, Mapping[str, int]]
+    before: Mapping[str, Mapping[str, int]],
+    after: Mapping[str, Mapping[str, int]],
+    part: str = "test",
 ) -> list[str]:
-    """Return the scenes that a division would test on, and an earlier one learned from or chose a
-    checkpoint by, without testing on them: where scenes came or went, others are shuffled.
+    """Return the scenes that a division would test or calibrate on, and an earlier one learned from
+    without having them in that part: where scenes came or went, others are shuffled. A test is of
+    scenes that no checkpoint was chosen by either.
 
     Args:
         before: Scenes of each part, as a training had them.
         after: Scenes of each part now.
+        part: `test` or `val`.
     """
-    learned = {*before.get("train", {}), *before.get("val", {})} - {*before.get("test", {})}
-    return sorted(learned & {*after.get("test", {})})
+    learned = {*before.get("train", {})}
+    if part == "test":
+        learned |= {*before.get("val", {})}
+    return sorted((learned - {*before.get(part, {})}) & {*after.get(part, {})})
 
 
 def _follow(name: str, split: Mapping[str, Share | None]) -> str:

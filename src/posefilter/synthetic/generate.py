@@ -202,6 +202,19 @@ def list_changed(out: Path, **settings: Any) -> list[str]:
     return _as_typed([*names, *(["frames"] if record.frames != settings["frames"] else [])])
 
 
+def shows_another_mesh(out: Path, store: MeshStore, name: str) -> bool:
+    """Tell whether the scenes of a dataset were rendered of another mesh of an object than a store
+    of meshes has; False where its record does not say, or is of another object.
+
+    Raises:
+        UserError: Its record, or the mesh, is damaged.
+    """
+    record = _read_record(out)
+    if record is None or record.mesh is None or record.settings.get("object") != name:
+        return False
+    return digest_mesh(store.load(name)) != record.mesh
+
+
 def _make_job(given: Mapping[str, Any]) -> Job:
     """Return what is rendered for the arguments of `generate`, by name."""
     low, high = given["distractors"]
