@@ -2,9 +2,11 @@
 
 import difflib
 import os
+import threading
 from collections.abc import Iterable, Sequence
 from fnmatch import fnmatch
 from pathlib import Path
+from typing import Any
 from urllib.parse import urlparse
 
 from posefilter.errors import UserError, find_reason
@@ -114,6 +116,23 @@ def expand_weights(weights: str | Path | Sequence[str | Path]) -> list[str | Pat
     return list(dict.fromkeys(found))
 
 
+def _fetch_registry(loader: Any, url: str, index: Path, wanted: Path) -> None:
+    """Download the list of weights, whole or not at all, since others may read it meanwhile. Where
+    the address cannot be reached, weights that are in the cache are judged by the list there.
+    """
+    import requests
+
+    part = index.with_name(f".{index.name}.{os.getpid()}.{threading.get_ident()}.part")
+    try:
+        loader(url + _REGISTRY, str(part), None)
+        part.replace(index)
+    except (requests.ConnectionError, requests.Timeout):
+        if not (wanted.is_file() and index.is_file()):
+            raise
+    finally:
+        part.unlink(missing_ok=True)
+
+
 def fetch_weights(name: str, url: str, cache: Path | None = None) -> Path:
     """Return weights from the cache, or download them there and check their SHA-256.
 
@@ -136,7 +155,7 @@ def fetch_weights(name: str, url: str, cache: Path | None = None) -> Path:
     loader = pooch.HTTPDownloader(timeout=_TIMEOUT)
     index = folder / _REGISTRY
     try:
-        loader(url + _REGISTRY, str(index), None)
+        _fetch_registry(loader, url, index, folder / f"{name}.ckpt")
         keeper = pooch.create(folder, url, retry_if_failed=2)
         keeper.load_registry(index)
         file = f"{name}.ckpt"

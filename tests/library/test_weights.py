@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import requests
 
 from posefilter.cli.checkpoints import find_checkpoint
 from posefilter.errors import UserError
@@ -139,6 +140,22 @@ def test_another_checksum_is_refused_and_nothing_is_kept(server: Server, tmp_pat
         fetch_weights("duck", server.url, tmp_path)
     assert "\n" not in str(caught.value)
     assert not list(tmp_path.glob("*.ckpt"))
+
+
+def test_what_is_in_the_cache_needs_no_network(
+    server: Server, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    fetched = fetch_weights("duck", server.url, tmp_path)
+
+    def fail(*_: object, **__: object) -> None:
+        raise requests.ConnectionError
+
+    monkeypatch.setattr(requests, "get", fail)
+    assert fetch_weights("duck", server.url, tmp_path) == fetched
+    fetched.write_bytes(CONTENT[:-1])  # damaged: it is not taken as it is
+    with pytest.raises(UserError, match="cannot be fetched"):
+        fetch_weights("duck", server.url, tmp_path)
+    assert {path.name for path in tmp_path.iterdir()} == {"duck.ckpt", "registry.txt"}
 
 
 def test_a_damaged_file_in_the_cache_is_fetched_anew(server: Server, tmp_path: Path) -> None:

@@ -55,6 +55,21 @@ def test_a_moving_object_is_followed_with_few_particles() -> None:
     assert result.belief.weights.sum() == pytest.approx(1)
 
 
+def test_the_seed_is_the_trackers_own_in_every_frame(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whatever else the estimator is used for between frames."""
+    toy, estimator = make_toy()
+    tracker = posefilter.Tracker(estimator, seed=1)
+    seeds = []
+    encode = toy.encode
+    monkeypatch.setattr(toy, "encode", lambda batch: (seeds.append(toy.seed), encode(batch))[1])
+    for pose in walk_pose(3):
+        toy.truth = pose
+        tracker.update(RGB, DEPTH, K)
+        toy.seed = 99  # as `predict` with another seed leaves it
+    assert len(seeds) >= 3
+    assert set(seeds) == {1}
+
+
 @pytest.mark.parametrize("shift", [0.03, 0.06])
 def test_an_object_that_starts_to_move_fast_is_followed(shift: float) -> None:
     """The noise grows by itself; a random walk of 5 mm stays behind by over a frame's motion."""

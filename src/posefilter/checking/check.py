@@ -85,6 +85,8 @@ def check_dataset(
         write_whole(folder / "data_report.json", json.dumps(report, indent=2) + "\n")
         if tiles:
             write_sheet(folder / "contact_sheet.png", tiles)
+        else:  # of an earlier dataset
+            (folder / "contact_sheet.png").unlink(missing_ok=True)
     return report
 
 

@@ -1,5 +1,7 @@
 """Build a method, from a configuration or from a checkpoint that carries its own."""
 
+from collections import Counter
+from collections.abc import Sequence
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -183,3 +185,13 @@ def is_calibrated_filter(settings: dict[str, Any], calibrated: dict[str, Any]) -
 
     (new, asked), (old, known) = split(settings), split(calibrated)
     return new == old and asked <= known
+
+
+def check_once(objects: Sequence[str]) -> None:
+    """Raise UserError where two checkpoints are of one object: its name tells answers apart."""
+    name, count = Counter(objects).most_common(1)[0]
+    if count > 1:
+        raise UserError(
+            f"checkpoint: {count} of them are of {name}; take one after the other, each with an "
+            "out= of its own"
+        )

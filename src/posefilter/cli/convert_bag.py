@@ -7,7 +7,7 @@ from pathlib import Path
 import torch
 from omegaconf import DictConfig
 
-from posefilter.cli.checkpoints import methods_of
+from posefilter.cli.checkpoints import check_once, methods_of
 from posefilter.cli.components import changes
 from posefilter.cli.console import JSON, ended, say, warn
 from posefilter.cli.doubts import say_commonest, say_doubt
@@ -42,6 +42,7 @@ def convert_bag(job: Job) -> None:
         settle(cfg.threads, cfg.seed)
         methods = methods_of(cfg.checkpoint, changes(cfg))
         estimator = Estimator(methods, costs=read_costs(cfg))
+        check_once(estimator.objects)
         find = choose_finder(estimator, cfg.track, cfg.seed)
         tally = Tally(dict.fromkeys(estimator.objects, 0))
         watch = bars(shown=cfg.console != JSON, transient=True)

@@ -18,7 +18,8 @@ def say_doubt(result: Result, image: str, warned: set[str], console: str, **fact
         console: Where to.
         facts: More, for machines.
     """
-    doubt = result.blank or (result.object if result.wrong_size else "")
+    # a reason's numbers are another in each image
+    doubt = re.sub(r"[\d.]+", "", result.blank) or (result.object if result.wrong_size else "")
     if doubt and doubt not in warned:
         warned.add(doubt)
         facts |= {"object": result.object, "warnings": list(result.warnings)}

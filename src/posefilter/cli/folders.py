@@ -52,6 +52,8 @@ class KeepResults(Callback):
         if config.hydra.job.name == "evaluate":
             if holds_evaluation(folder):
                 refuse(folder, "an evaluation already; choose another folder: out=DIR")
+            if (folder / "tracks.csv").is_file():
+                refuse(folder, "tracks; choose another folder: out=DIR")
         elif holds_run(folder) and not config.get("resume") and not is_follower():
             refuse(folder, f"a run already; choose another folder, or resume it: resume={folder}")
         elif config.hydra.job.name == "train" and not config.get("resume") and not is_follower():

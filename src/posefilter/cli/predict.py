@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from omegaconf import DictConfig, ListConfig
 
-from posefilter.cli.checkpoints import method_of, methods_of, read_checkpoint
+from posefilter.cli.checkpoints import check_once, method_of, methods_of, read_checkpoint
 from posefilter.cli.components import changes
 from posefilter.cli.console import JSON, ended
 from posefilter.cli.job import Job
@@ -127,9 +127,13 @@ def predict_several(job: Job) -> list[Result]:
     found; one overlay of those that are not absent; poses.csv, and each one's belief.
     """
     cfg, folder = job.cfg, job.folder
+    if (folder / "poses.csv").is_file() and not (folder / "poses.json").is_file():
+        raise UserError(f"out={folder}: its poses.csv is of another command; choose another folder")
     costs, tolerance = read_costs(cfg), read_pose_tolerance(cfg.pose_tolerance)
     methods = methods_of(cfg.checkpoint, changes(cfg))
     estimator = Estimator(methods, costs=costs, pose_tolerance=tolerance)
+    if cfg.instances is not None:
+        check_once(estimator.objects)
     rgb, depth, K = read_inputs(cfg)
     store = open_shapes(cfg, estimator.objects)
     if cfg.instances is None:
@@ -159,7 +163,8 @@ def predict_several(job: Job) -> list[Result]:
     missing = [name for name in absent if name not in {one.object for one in results}]
     answers += [describe_absent(one, scores[one], costs, own[one], job) for one in missing]
     write_json(folder / "poses.json", answers)
-    write_poses_csv(folder / "poses.csv", list_rows(seen, estimator.objects))
+    seconds = sum(one.seconds for one in results)  # of those that are absent, too
+    write_poses_csv(folder / "poses.csv", list_rows(seen, estimator.objects, seconds))
     files = {"poses": folder / "poses.json", "poses.csv": folder / "poses.csv"}
     files |= {"overlay": folder / "overlay.png", "beliefs": beliefs}
     ended(cfg.console, "predicted", files, [], poses=answers)
@@ -176,11 +181,12 @@ def remove_answers(folder: Path) -> None:
         (folder / "beliefs").rmdir()
 
 
-def list_rows(results: Sequence[Result], objects: Sequence[str]) -> list[PoseRow]:
+def list_rows(results: Sequence[Result], objects: Sequence[str], seconds: float) -> list[PoseRow]:
     """Return results as lines of a BOP results file: of scene 0 and image 0, in the frame of the
     mesh files, and with the objects' numbers of `number_objects`.
+
+    seconds: That the image took; the challenge's time is that of an image.
     """
-    seconds = sum(one.seconds for one in results)  # the challenge's time is that of an image
     rows, numbers = [], number_objects(objects)
     for one in results:
         number = numbers[one.object]

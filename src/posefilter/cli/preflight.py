@@ -29,7 +29,10 @@ _IS_FOLDER = {"rgb": _ONE_IMAGE, "depth": _ONE_IMAGE, "estimates": "is a folder;
 _SWITCHES = {
     "calibrate": ("overwrite",),
     "convert_bag": ("rectify", "track", "copy_messages"),
+    "export": ("quantize",),
+    "generate": ("stereo", "settle", "progress"),
     "predict": ("save_rerun",),
+    "track": ("save_rerun",),
 }
 # by the class of a logger: the package that it needs, which is an extra of ours by the same name
 _LOGGERS = {

@@ -1,7 +1,6 @@
 """Follow objects through videos: poses, figures, and an annotated video."""
 
 import math
-from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import closing
 from pathlib import Path
@@ -11,7 +10,7 @@ import numpy as np
 import torch
 from omegaconf import DictConfig, OmegaConf
 
-from posefilter.cli.checkpoints import methods_of
+from posefilter.cli.checkpoints import check_once, methods_of
 from posefilter.cli.components import changes
 from posefilter.cli.console import JSON, ended, finite, say, show_table, warn
 from posefilter.cli.doubts import say_commonest, say_doubt
@@ -60,7 +59,7 @@ def track(job: Job) -> None:
     threads = torch.get_num_threads()
     settings = make_settings(cfg.tracker)
     estimator = Estimator(methods_of(cfg.checkpoint, changes(cfg)))
-    _check_once(estimator.objects)
+    check_once(estimator.objects)
     videos, native = open_videos(cfg, estimator.objects)
     store = open_shapes(cfg, estimator.objects)
     shapes = {model.name: load_shape(store, model) for model in estimator.object_models}
@@ -111,16 +110,6 @@ def track(job: Job) -> None:
         raise UserError(f"{broken}; the {count} frames before it are in {folder}") from broken
     if broken is not None:
         raise broken
-
-
-def _check_once(objects: Sequence[str]) -> None:
-    """Raise UserError where two checkpoints are of one object: its name tells tracks apart."""
-    name, count = Counter(objects).most_common(1)[0]
-    if count > 1:
-        raise UserError(
-            f"checkpoint: {count} of them are of {name}; track with one after the other, each with "
-            "an out= of its own"
-        )
 
 
 def follow(

@@ -76,9 +76,13 @@ def to_pose_row(row: TrackRow, native_from_mesh: NativeFromMesh) -> PoseRow:
 
 
 def check_unused(folder: Path) -> None:
-    """Raise UserError where a folder holds tracks, or what a killed `track.py` has left of some."""
+    """Raise UserError where a folder holds tracks, or what a killed `track.py` has left of some, or
+    a run.
+    """
     if (folder / POSES).is_file():
         raise UserError(f"out={folder}: holds tracks already; choose another folder: out=DIR")
+    if (folder / "metrics.json").is_file() or (folder / "checkpoints").is_dir():
+        raise UserError(f"out={folder}: holds a run; choose another folder: out=DIR")
     lines, poses = folder / _LINES, folder / _CSV
     if os.path.lexists(lines) or os.path.lexists(poses):
         raise UserError(

@@ -188,6 +188,7 @@ class Track:
     def update(self, frame: Frame) -> TrackResult:
         """Return where the object is in the next frame."""
         start = time.perf_counter()
+        self.method.seed = self.seed  # others may use the method too, with seeds of their own
         predicted = None if self.state is None else self._predict(self.state)
         lost, rests, window = self.loss_detector.lost, self._rests, None
         if predicted is not None and not lost:
@@ -241,7 +242,6 @@ class Track:
 
     def _estimate(self, batch: Batch) -> FrameEstimate:
         """Run the estimator's own filter on the whole image."""
-        self.method.seed = self.seed
         trace = self.method.predict_step(batch, 0)
         size = self.method.measure_apparent_size(trace, batch)
         return self._weigh(batch, trace, with_margin=True)._replace(size=size)
