@@ -64,6 +64,7 @@ def test_a_long_training_prints_its_progress(
     )
     lines, module = Lines(pause=60), SimpleNamespace()
     lines.on_train_start(trainer, module)  # type: ignore[arg-type]
+    lines.on_train_batch_start(trainer, module)  # type: ignore[arg-type]
     for step, seconds in ((1, 30), (2, 61), (3, 100)):
         trainer.global_step, now[0] = step, seconds
         lines.on_train_batch_end(trainer, module)  # type: ignore[arg-type]
@@ -72,6 +73,37 @@ def test_a_long_training_prints_its_progress(
     now[0] = 159
     lines.on_train_batch_end(trainer, module)  # type: ignore[arg-type]
     assert capsys.readouterr().out.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    ("before", "spent", "left"),
+    [(0.0, 0.25, "3 min 0 s left"), (0.5, 0.75, "1 min 0 s left"), (0.0, 0.05, "9 min 0 s left")],
+)
+def test_the_time_left_is_that_of_a_time_budget_which_ends_the_training_sooner(
+    before: float,
+    spent: float,
+    left: str,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """After 60 s and a tenth of the steps; the budget's share is known once the training began, and
+    part of it may be of an earlier sitting.
+    """
+    now = [0.0]
+    monkeypatch.setattr("posefilter.cli.progress_bar.time.perf_counter", lambda: now[0])
+    trainer: Any = SimpleNamespace(
+        global_step=0,
+        estimated_stepping_batches=100,
+        callback_metrics={},
+        sanity_checking=False,
+    )
+    lines, module = Lines(pause=60), SimpleNamespace(time_spent=0.0)
+    lines.on_train_start(trainer, module)  # type: ignore[arg-type]
+    module.time_spent = before
+    lines.on_train_batch_start(trainer, module)  # type: ignore[arg-type]
+    trainer.global_step, now[0], module.time_spent = 10, 60, spent
+    lines.on_train_batch_end(trainer, module)  # type: ignore[arg-type]
+    assert capsys.readouterr().out == f"step 10 of 100: 0.17 steps/s, {left}\n"
 
 
 def test_a_long_test_prints_its_progress(
@@ -100,6 +132,7 @@ def test_a_validation_is_one_line(console: str, capsys: pytest.CaptureFixture[st
     )
     lines, module = Lines(console), SimpleNamespace()
     lines.on_train_start(trainer, module)  # type: ignore[arg-type]
+    lines.on_train_batch_start(trainer, module)  # type: ignore[arg-type]
     trainer.global_step = 20
     lines.on_validation_end(trainer, module)  # type: ignore[arg-type]
     out = capsys.readouterr().out

@@ -4,6 +4,7 @@ left is the time of the stages that are not done.
 
 import json
 from dataclasses import replace
+from functools import cached_property
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -58,7 +59,7 @@ def test_what_is_left_is_the_time_of_the_stages_that_are_not_done(tmp_path: Path
     assert work.rest(speed) == 120 + 25
 
 
-def test_the_time_of_measuring_is_not_given_to_the_training(
+def test_the_time_of_measuring_and_of_building_is_not_given_to_the_training(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     settings = {"frames": 400, "test_frames": 60, "steps": None, "budget_minutes": 30}
@@ -70,16 +71,23 @@ def test_the_time_of_measuring_is_not_given_to_the_training(
         now[0] += 70
         return speed
 
+    def build_run(work: Onboarding) -> SimpleNamespace:
+        now[0] += 20
+        return SimpleNamespace(trainer=run)
+
     monkeypatch.setattr("time.perf_counter", lambda: now[0])
     monkeypatch.setattr(command, "measure_speed", measure)
     monkeypatch.setattr(command, "fit", lambda run: {})
     monkeypatch.setattr(Onboarding, "job", lambda *_: None)
-    monkeypatch.setattr(Onboarding, "run", SimpleNamespace(trainer=run))
+    building = cached_property(build_run)
+    building.__set_name__(Onboarding, "run")
+    monkeypatch.setattr(Onboarding, "run", building)
     monkeypatch.setattr(Onboarding, "is_done", lambda *_: True)
     command.train(work)
     values = work.stages.values
     assert values["steps"] * values["seconds_per_step"] == pytest.approx(30 * 60 - 70)
-    assert len(run.callbacks) == 1  # which keeps to it
+    (budget,) = run.callbacks
+    assert budget.seconds == pytest.approx(30 * 60 - 70 - 20)
 
 
 @pytest.fixture

@@ -432,7 +432,10 @@ def train(work: Onboarding) -> None:
         say(console, "steps", sentence, steps=steps, seconds_per_step=seconds)
     if work.cfg.steps is None:  # the machine may turn out slower than it was measured
         seconds = values["steps"] * values["seconds_per_step"]
-        work.run.trainer.callbacks.append(TimeBudget(seconds))
+        began = time.perf_counter()
+        callbacks = work.run.trainer.callbacks  # built here, and the frames' list read: that counts
+        seconds = max(seconds / 2, seconds - (time.perf_counter() - began))
+        callbacks.append(TimeBudget(seconds))
     work.stages.keep(training=fit(work.run))
 
 

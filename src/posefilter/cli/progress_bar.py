@@ -46,6 +46,13 @@ def count_steps(trainer: Trainer) -> int | None:
     return int(steps) if math.isfinite(steps) else None
 
 
+def measure_done(trainer: Trainer, module: LightningModule, steps: int) -> float:
+    """Return the share of a training that is done, by its steps or by its time budget, whichever is
+    more: the budget may end it before its last step.
+    """
+    return max(trainer.global_step / steps, float(getattr(module, "time_spent", 0.0)))
+
+
 class Lines(Callback):
     """A line at each validation; in a training or a test a sign of life every `pause` seconds: how
     far, how long still.
@@ -55,22 +62,28 @@ class Lines(Callback):
         self.console, self.pause = console, pause
         self._began, self._step, self._last = 0.0, 0, 0.0
         self._steps: int | None = None
+        self._done: float | None = None  # share of the training, by earlier sittings
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Start the clock."""
         self._began, self._step = time.perf_counter(), trainer.global_step
-        self._last, self._steps = self._began, count_steps(trainer)
+        self._last, self._steps, self._done = self._began, count_steps(trainer), None
+
+    def on_train_batch_start(self, trainer: Trainer, pl_module: LightningModule, *_: Any) -> None:
+        """Note what is done: by then the time budget has said it, in whatever order both come."""
+        if self._done is None and self._steps is not None:
+            self._done = measure_done(trainer, pl_module, self._steps)
 
     def on_train_batch_end(self, trainer: Trainer, pl_module: LightningModule, *_: Any) -> None:
         """Print a line where nothing was said for long."""
         if time.perf_counter() - self._last >= self.pause:
             loss = {k: v for k, v in trainer.callback_metrics.items() if k == "train/loss"}
-            self._tell("training", trainer, loss)
+            self._tell("training", trainer, pl_module, loss)
 
     def on_validation_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Print the line."""
         if not trainer.sanity_checking:
-            self._tell("validation", trainer, trainer.callback_metrics)
+            self._tell("validation", trainer, pl_module, trainer.callback_metrics)
 
     def on_test_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Start the clock again."""
@@ -86,12 +99,18 @@ class Lines(Callback):
         sentence = f"batch {done} of {batches}: {left} left"
         say(self.console, "testing", sentence, batch=done, batches=batches)
 
-    def _tell(self, event: str, trainer: Trainer, seen: dict[str, Any]) -> None:
+    def _tell(
+        self, event: str, trainer: Trainer, module: LightningModule, seen: dict[str, Any]
+    ) -> None:
         step, steps, self._last = trainer.global_step, self._steps, time.perf_counter()
-        rate = (step - self._step) / max(self._last - self._began, 1e-9)
+        elapsed = max(self._last - self._began, 1e-9)
+        rate = (step - self._step) / elapsed
         pace = f"{rate:.2f} steps/s"
-        if rate > 0 and steps is not None and steps > step:
-            pace += f", {format_duration((steps - step) / rate)} left"
+        if steps is not None and self._done is not None:
+            done = measure_done(trainer, module, steps)
+            if self._done < done < 1:
+                left = elapsed * (1 - done) / (done - self._done)
+                pace += f", {format_duration(left)} left"
         words = ", ".join(part for part in (format_metrics(seen), pace) if part)
         numbers: dict[str, float | None] = {"step": step, "steps": steps}
         for name, value in seen.items():
@@ -124,7 +143,10 @@ class Bars(Callback):
         every: int = trainer.log_every_n_steps  # type: ignore[attr-defined]
         if trainer.global_step % every == 0 or trainer.global_step == trainer.max_steps:
             said = {"said": briefly(trainer.callback_metrics)}
-        self._shown().update(self._training, completed=trainer.global_step, **said)
+        steps, step = count_steps(trainer), trainer.global_step
+        if steps is not None:
+            step = round(steps * measure_done(trainer, pl_module, steps))
+        self._shown().update(self._training, completed=step, **said)
 
     def on_validation_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Open a bar for the validation."""
