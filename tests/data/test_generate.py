@@ -16,6 +16,7 @@ import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
 
+from posefilter.data.generated_scenes import ensure_scenes
 from posefilter.errors import UserError
 from posefilter.meshes.store import MeshStore
 from posefilter.rendering.embree import EmbreeRenderer, render_depth
@@ -307,6 +308,21 @@ def test_meshes_in_millimeters_take_a_scale_and_a_failed_start_blocks_nothing(
             for folder in (out, in_meters)
         )
         assert (scaled == plain).mean() > 0.99
+
+
+def test_a_dataset_that_was_begun_with_too_many_frames_may_have_fewer(tmp_path: Path) -> None:
+    how = {"object": "brick", "distractors": (0, 0), "progress": False}
+    how |= {"size": (96, 72), "workers": 1}
+    generate(tmp_path / "out", 2, **how)
+    file = tmp_path / "out" / "_generator.json"
+    record = json.loads(file.read_text())
+    file.write_text(json.dumps({**record, "frames": 10}))  # as if it had been stopped
+    with pytest.raises(UserError, match="only 2 of 10 scenes' frames"):
+        ensure_scenes(tmp_path / "out", None)
+    generate(tmp_path / "out", 2, **how)
+    ensure_scenes(tmp_path / "out", None)
+    generate(tmp_path / "out", 1, **how)  # those that are there stay
+    assert json.loads(file.read_text())["frames"] == 2
 
 
 def test_a_dataset_is_not_gone_on_with_once_its_mesh_has_changed(tmp_path: Path) -> None:

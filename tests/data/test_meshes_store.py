@@ -205,6 +205,24 @@ def test_known_parts_follow_the_frame_of_the_mesh(moved: bool, tmp_path: Path) -
     assert low - place[1, 3] == pytest.approx(-0.013, abs=0.01)
 
 
+@pytest.mark.parametrize("file", ["symmetries.json", "parts.json"])
+def test_a_file_that_names_no_object_is_not_of_all_in_its_folder(file: str, tmp_path: Path) -> None:
+    entry = {"symmetries_continuous": [{"axis": [0, 0, 1]}]}
+    foot = {"foot": {"box": [[-9, -9, -9], [9, 9, 9]]}}
+    (tmp_path / file).write_text(json.dumps(entry if file == "symmetries.json" else foot))
+    _box(tmp_path / "can.ply")
+    mesh = MeshStore(tmp_path).load("can")  # of whom else could it be?
+    assert len(mesh.symmetries) > 1 or set(mesh.parts) == {"foot"}
+    _box(tmp_path / "carton.ply")
+    assert "does not say of which of 2 objects it is" in _fails(MeshStore(tmp_path), "carton")
+    (tmp_path / "tin").mkdir()
+    (tmp_path / file).rename(tmp_path / "tin" / file)
+    _box(tmp_path / "tin" / "tin.ply")
+    mesh = MeshStore(tmp_path).load("tin")
+    assert len(mesh.symmetries) > 1 or set(mesh.parts) == {"foot"}
+    assert len(MeshStore(tmp_path).load("can").symmetries) == 1
+
+
 def test_a_file_about_other_objects_hides_no_table(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -31,7 +31,9 @@ from dataset_trees import (
 from torch.utils.data import default_collate
 
 from posefilter.data.augmentation import PasteOccluder, RandomCrop
+from posefilter.data.cache import DiskCache
 from posefilter.data.dataset import EpochShuffle, FrameDataset
+from posefilter.data.frames import FrameRecord
 from posefilter.data.loaders import make_loader, spare_cores
 from posefilter.data.module import PoseDataModule
 from posefilter.errors import BadData, UserError
@@ -290,6 +292,16 @@ def test_the_disk_cache_is_renewed_when_the_camera_the_meshes_or_their_unit_chan
     faces = (" ".join(line) for line in lines if line[0] == "f")
     mesh.write_text("\n".join([*bigger, *faces]) + "\n")
     assert read()[0] < 0.5 * first[0]
+
+
+def test_the_disk_cache_knows_which_object_a_record_is_of(tmp_path: Path) -> None:
+    """A record keeps its name and its files where only the names of the classes were mended."""
+    (tmp_path / "a.png").touch()
+    one = FrameRecord("a", "scene", 0, 0, 1, "can", 0, (tmp_path / "a.png",))
+    cache = DiskCache(tmp_path / "cache", "1")
+    other = dataclasses.replace(one, object="box")
+    assert cache._record_path(one) == cache._record_path(one)
+    assert cache._record_path(one) != cache._record_path(other)
 
 
 def test_the_disk_cache_is_renewed_when_the_unit_of_the_depth_changes(tmp_path):

@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 from dataset_trees import bop_scene, fat_folder, fat_frame, fat_tree, pose, write_mesh
 
+from posefilter.data.readers.bop import BopReader
 from posefilter.data.readers.fat import FatReader
 from posefilter.data.readers.registry import open_whole
 from posefilter.data.sequences import SceneVideo, list_scenes
-from posefilter.errors import UserError
+from posefilter.errors import BadData, UserError
 from posefilter.meshes.store import MeshStore
 
 EYES = ("left", "right")
@@ -63,6 +64,36 @@ def test_a_bop_dataset_of_ycb_objects_is_called_as_the_objects_that_are_asked_fo
     assert set(frame.truth) == {name}
     own = open_whole("bop", tmp_path / "data", ["obj_000005"], meshes, mesh_frame=None)
     assert own.objects == ("obj_000002", "obj_000005")
+
+
+def test_an_object_of_no_known_frame_ends_no_track_of_another(tmp_path: Path) -> None:
+    """The public mesh of the wood block is another scan than BOP's."""
+    bop_scene(tmp_path / "data" / "000048", [[(2, NEAR), (16, FAR)]])
+    meshes = MeshStore(write_mesh(tmp_path / "meshes", "003_cracker_box"))
+    reader = open_whole("bop", tmp_path / "data", ["003_cracker_box"], meshes, mesh_frame=None)
+    assert reader.objects == ("003_cracker_box",)
+    with pytest.raises(UserError, match="036_wood_block: no relation"):
+        BopReader(tmp_path / "data", ["036_wood_block"], meshes, mesh_frame="original")
+
+
+def test_an_object_that_was_not_asked_for_spoils_no_frame(tmp_path: Path) -> None:
+    """Such as two instances of it, and no mesh to tell them apart: its picture is not needed."""
+    folder = fat_folder(tmp_path / "mixed" / "kitchen_0", {"other": 12, "toy": 24})
+    fat_frame(folder, 0, [("other", 12, FAR), ("toy", 24, NEAR)], "left")
+    reader = FatReader(tmp_path)
+    read = reader.read
+
+    def refuse(number: int) -> object:
+        if reader.records()[number].object == "other":
+            raise BadData("two instances of one class")
+        return read(number)
+
+    assert reader.records()[0].object == "other"
+    reader.read = refuse  # type: ignore[method-assign,assignment]
+    (scene,) = list_scenes(reader)
+    frame = SceneVideo(reader, scene, ["toy"]).read(0)
+    assert frame is not None
+    assert set(frame.truth) == {"toy"}
 
 
 def test_a_part_is_read_by_itself(tmp_path: Path) -> None:

@@ -14,6 +14,7 @@ from posefilter.errors import UserError
 from posefilter.meshes.mesh import Mesh
 from posefilter.meshes.store import MeshStore
 from posefilter.rendering.embree import EmbreeRenderer
+from posefilter.synthetic import scenes
 from posefilter.synthetic.generate import camera_matrix, generate
 from posefilter.synthetic.lookalikes import box, make_lookalike
 from posefilter.synthetic.placing import View
@@ -261,6 +262,24 @@ def test_settled_objects_lie_on_the_table_and_touch_but_do_not_mix(scene: SceneS
                 < 0.98
             )
     assert tilts > 0  # placed by hand, boxes and cans only ever stand or lie square
+
+
+def test_a_copy_that_rolls_off_the_table_is_another_draw(
+    scene: SceneSet, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(scenes, "settle", lambda placed, table, rng: [placed[0], *placed[2:]])
+    settings = SceneSettings(
+        tabletop_fraction=1.0, settle=True, distractors=(2, 3), instances=2, occluded_fraction=0.0
+    )
+    for seed in range(6):
+        rng = np.random.default_rng(seed)
+        assert scenes.draw_layout(scene, settings, K, H, W, rng) is None
+
+
+def test_occluders_are_aimed_at_the_occlusion_that_is_allowed(scene: SceneSet) -> None:
+    settings = SceneSettings(max_occlusion=0.3, occluded_fraction=1.0, distractors=(3, 5))
+    visible = [View(K, H, W).visible(layout.placed) for layout in draw(scene, settings, 24)]
+    assert np.mean([0.68 < share < 0.9 for share in visible]) > 0.6
 
 
 def test_solids_measure_their_mesh(library: SolidStore) -> None:

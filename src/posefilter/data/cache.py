@@ -25,7 +25,7 @@ _UNITS = 10_000.0  # a meter
 FARTHEST = 65535 / _UNITS  # [m] depth that is kept
 # of the files of a `DiskCache`: one more whenever they change, so that none of another layout is
 # read
-_LAYOUT = 4
+_LAYOUT = 5
 _STALE = 3600.0  # [s] after which a file that is not whole has no writer any more
 
 
@@ -155,7 +155,7 @@ class DiskCache:
         return self._path(digest, ".npy")
 
     def _record_path(self, record: FrameRecord) -> Path:
-        name = f"{record.key} {stamp_files(record.files)}"
+        name = f"{record.key} {record.object} {stamp_files(record.files)}"
         return self._path(hashlib.sha256(name.encode()).digest(), ".npz")
 
     def _path(self, digest: bytes, suffix: str) -> Path:

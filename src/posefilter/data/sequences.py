@@ -184,7 +184,9 @@ class SceneVideo(Video):
         """Return a frame; None where nothing of it is labeled, so that no reader opens it."""
         truth: dict[str, np.ndarray] = {}
         sample = None
-        for number, record in self._frames[index]:
+        # of the others only the picture is needed, where none of the wanted gives it
+        frames = sorted(self._frames[index], key=lambda one: one[1].object not in self._wanted)
+        for number, record in frames:
             wanted = record.object in self._wanted and record.object not in truth
             if sample is not None and not wanted:
                 continue

@@ -66,6 +66,14 @@ def declares_parts(file: Path, name: str) -> bool:
     return not isinstance(table, dict) or name in table or _is_of_one(table)
 
 
+def has_one_object(file: Path) -> bool:
+    """Return whether a file in the format of `read_parts` holds the parts of one object alone, and
+    does not say of which.
+    """
+    table = read_json(file, _MOST_BYTES)
+    return isinstance(table, dict) and _is_of_one(table)
+
+
 def _is_of_one(table: Mapping[str, object]) -> bool:
     """Return whether a file holds the parts of one object alone."""
     return any(isinstance(one, dict) and {"box", "vertices"} & set(one) for one in table.values())

@@ -3,7 +3,7 @@
 import difflib
 import logging
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,8 +15,21 @@ from posefilter.meshes import ycb
 from posefilter.meshes.builtin import catalog as builtin
 from posefilter.meshes.files import SUFFIXES, read_mesh
 from posefilter.meshes.mesh import Mesh, diameter, object_model
-from posefilter.meshes.parts import FILE, declares_parts, read_parts, split_part, take_faces
-from posefilter.meshes.symmetries import declares, identity_first, read_symmetries, symmetry_group
+from posefilter.meshes.parts import (
+    FILE,
+    declares_parts,
+    has_one_object,
+    read_parts,
+    split_part,
+    take_faces,
+)
+from posefilter.meshes.symmetries import (
+    declares,
+    has_one_group,
+    identity_first,
+    read_symmetries,
+    symmetry_group,
+)
 
 __all__ = ["Mesh", "MeshStore", "object_model", "symmetry_group"]
 
@@ -147,6 +160,7 @@ class MeshStore:
         """Return the declared parts of an object of a folder."""
         for folder in self._folders_of(name):
             if (folder / FILE).is_file() and declares_parts(folder / FILE, name):
+                self._refuse_shared(folder / FILE, has_one_object)
                 return read_parts(folder / FILE, name, self.scale, mesh)
         place = self._find_ycb_frame(name, mesh)
         if place is None:
@@ -168,6 +182,16 @@ class MeshStore:
             )
         return place
 
+    def _refuse_shared(self, file: Path, holds_one: Callable[[Path], bool]) -> None:
+        """Raise UserError where a file that does not say of which object it is lies in the folder
+        of several.
+        """
+        if file.parent == Path(self.root) and len(self._files) > 1 and holds_one(file):
+            raise UserError(
+                f"{file}: does not say of which of {len(self._files)} objects it is; put it under "
+                "the object's name, or into the object's own folder"
+            )
+
     def _folders_of(self, name: str) -> list[Path]:
         """Return where files beside a mesh are looked for, nearest first."""
         file = self._files[name]
@@ -184,6 +208,7 @@ class MeshStore:
         for folder in self._folders_of(name):
             for info in (folder / "symmetries.json", folder / "models_info.json"):
                 if info.is_file() and declares(info, name):
+                    self._refuse_shared(info, has_one_group)
                     return read_symmetries(info, name, self.scale, self.symmetry_steps)
         turns = ycb.symmetries(name, self.symmetry_steps)
         place = None if turns is None else self._find_ycb_frame(name, mesh)

@@ -91,6 +91,14 @@ def declares(info: Path, name: str) -> bool:
     return not plain or bool({*_list_keys(name)} & set(table) or _ALONE & set(table))
 
 
+def has_one_group(info: Path) -> bool:
+    """Return whether a file in the format of `read_symmetries` holds the entry of one object alone,
+    and does not say of which.
+    """
+    table = read_json(info, _MOST_BYTES)
+    return isinstance(table, dict) and bool(_ALONE & set(table))
+
+
 def _list_keys(name: str) -> list[str]:
     """Return what an object may be called in a file."""
     digits = "".join(c for c in name if c.isdigit())

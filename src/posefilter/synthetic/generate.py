@@ -380,7 +380,8 @@ def _open_dataset(out: Path, job: Job, frames: int, mesh: str | None) -> None:
                 "changed since; choose another out="
             )
         else:
-            frames, mesh = max(frames, record.frames), mesh or record.mesh
+            there = sum(1 for _ in out.glob("mixed/*/[0-9]*.left.json"))
+            frames, mesh = max(frames, there), mesh or record.mesh
         remove_parts(out, [".", "mixed/*"])
     elif out.is_dir() and any(path.name != LOCK for path in out.iterdir()):
         raise UserError(

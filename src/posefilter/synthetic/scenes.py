@@ -155,7 +155,9 @@ def draw_layout(
     view = View(K, height, width)
     occluded = bool(rng.random() < settings.occluded_fraction)
     least = 1 - settings.max_occlusion
-    low, high = (min(max(0.28, least), 0.6), 0.6) if occluded else (max(0.6, least), 1.0)
+    low, high = max(0.6, least), 1.0
+    if occluded:  # at what is allowed; outlines only predict it
+        low, high = max(0.28, least), 0.6 if least <= 0.6 else min(1.0, least + 0.08)
     wanted = rng.uniform(low, high)
     tabletop = bool(rng.random() < settings.tabletop_fraction)
     # not every corner of a table has room in front of the target
@@ -214,8 +216,10 @@ def _draw_objects(
             placed.append(one)
     if settings.settle and table is not None:
         placed = settle(placed, table, rng)
+        own = placed[: settings.instances]  # a copy may have rolled off the table
+        lost = len(own) < settings.instances or any(one.solid is not target.solid for one in own)
         hidden = view.visible(placed) < 1 - settings.max_occlusion
-        if hidden or not view.holds(placed[0], largest):
+        if lost or hidden or not all(view.holds(one, largest) for one in own):
             return [], table
     return placed, table
 

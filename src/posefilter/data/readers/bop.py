@@ -129,6 +129,9 @@ class BopReader(BaseReader):
                 f"{base}: its scenes have no '{', '.join(map(str, wanted or []))}' (data.object), "
                 f"YCB-V's name of a number; they have {own}; data.object=null takes all"
             ) from error
+        if wanted is None and self._mesh_frame == "original":  # of others the frame is not known
+            related = {*ycb.CLASSES} - ycb.WITHOUT_GEOMETRY
+            self.objects = tuple(name for name in self.objects if name in related)
         self._distrust_builtin()
         self._native = {name: self.native_from_mesh(name) for name in self.objects}
         self._entries = [
