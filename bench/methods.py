@@ -39,6 +39,7 @@ SHIPPED = "weights/003_cracker_box.ckpt"  # of pose_pf
 MEMORISED = "memorize/experiment=memorize,model={},seed=0,variant=working"
 HELD_OUT = "held_out/model={},seed=0"
 OTHER_RUN = "objects/{}/*model={},*"  # its name is cut
+SPARSE_RUN = "sparse/{}/*encoder={},*seed={},*"
 OTHER_OBJECTS = ("009_gelatin_box", "006_mustard_bottle", "004_sugar_box", "002_master_chef_can")
 POSE_ROWS = "model=pose_pf sweep=ablation_pose_pf"
 POSE_RUN = "ablation_pose_pf/ablation={},model=pose_pf,seed=0,sweep=ablation_pose_pf"
@@ -152,7 +153,7 @@ def plan(meshes: str | None = None, frames: str | None = None) -> list[Line]:
         Line("patch", "model=patch_pf experiment=memorize sweep=patch seed=0"),
     ]
     lines += [*list_pose_space(), *list_paper(), *list_choices(), *list_long()]
-    lines += list_units_at_full_size()
+    lines += [*list_units_at_full_size(), *list_sparse()]
     if meshes:
         box = f"{FOUR} experiment=cracker_box_pixels data.meshes={meshes} seed=0"
         lines.append(Line("cracker_box", box))
@@ -182,6 +183,8 @@ def list_other_objects(meshes: str, frames: str | None) -> list[Line]:
         for models, steps in ((DETECTORS, 1500), (WITH_POSE, 3000)):
             size = f"trainer.max_steps={steps} trainer.val_check_interval={steps // 2}"
             lines.append(Line("objects", f"model={','.join(models)} {at} {size}", into=name))
+        foveated = f"model=patch_pf model/encoder=foveated {at} {size}"
+        lines.append(Line("objects_foveated", foveated, into=name))
     if frames:
         real = "data=ycb_video data.root={} data.meshes={} data.object={}"
         lines += [
@@ -193,6 +196,15 @@ def list_other_objects(meshes: str, frames: str | None) -> list[Line]:
             )
             for name in OTHER_OBJECTS
             for model in MODELS
+        ]
+        lines += [
+            Line(
+                "object_frames_foveated",
+                real.format(frames, meshes, name),
+                f"objects_foveated/{name}/*",
+                name,
+            )
+            for name in OTHER_OBJECTS
         ]
     return lines
 
@@ -206,10 +218,16 @@ def list_units() -> list[Line]:
     untrained = f"experiment=memorize variant=paper {UNTRAINED} callbacks=checkpoints"
     lines = [
         Line("unit_untrained", f"{FOUR} {untrained} {UNITS} seed=0,1,2"),
-        # what to hold the other seeds of patch_pf in unit_full against
+        # what to hold the other seeds of unit_full against
         Line(
             "unit_untrained",
             f"model=patch_pf {untrained} model.displacement.unit=10,1,learned seed=3,4",
+        ),
+        Line(
+            "unit_untrained",
+            f"model=downsized,cnn_patch,pixel_pf {untrained} "
+            "model.displacement.unit=10,1,learned seed=3,4",
+            into="more_seeds",
         ),
     ]
     paper = "experiment=memorize ablation=paper callbacks=checkpoints"
@@ -226,6 +244,16 @@ def list_units() -> list[Line]:
         if model in DETECTORS:
             size = "sweep=ablation_detect filter.particles=8 model.net.width=16"
         lines.append(Line("unit", f"model={model} {paper} {size} {UNITS} seed=0,1,2"))
+    # bounded, in the unit of the unbounded one: which of both brings particles onto the object?
+    bounded = "experiment=memorize sweep=ablation_detect ablation=s2_bounded"
+    lines += [
+        Line(
+            "ablation_detect",
+            f"model={model} {bounded} model.displacement.max_displacement=0.5 seed=0,1,2",
+            into=f"{model}_bound",
+        )
+        for model in DETECTORS
+    ]
     return lines
 
 
@@ -240,6 +268,47 @@ def list_units_at_full_size() -> list[Line]:
         choice = f"model.displacement.unit={units} seed=0,1,2,3,4"
         lines.append(Line("unit_full", f"model={model} {paper} {choice}", into=model))
     return lines
+
+
+def list_sparse() -> list[Line]:
+    """Return patch_pf on held-out scenes with less and less of the image besides a particle's own
+    patch, for half the preset's steps; and for the first of these runs guided starts and
+    resampling when testing, as the paper's last section proposes.
+    """
+    patch = "model=patch_pf trainer.max_steps=3000 trainer.val_check_interval=3000"
+    seeds = "seed=0,1,2"
+    unet = f"{patch} model/encoder=unet"
+    guided = (
+        "filter/initialize=uniform,from_objectness "
+        "filter/resample=none,systematic,auxiliary filter.particles=32,128"
+    )
+    return [
+        Line("sparse", f"{unet} {seeds}", into="unet"),
+        Line("sparse", f"{patch} model/encoder=foveated,none,pyramid {seeds}", into="others"),
+        Line("sparse", f"{unet} model.encoder.max_width_px=80,40 {seeds}", into="narrow"),
+        Line("sparse", f"{patch} model/encoder=foveated data.image_width=320 {seeds}", into="wide"),
+        *(
+            # the row of a test has the seed of its draws: that of the training as well
+            Line(
+                "guided",
+                f"{guided} seed={seed}",
+                SPARSE_RUN.format("unet", "unet", seed),
+                into=f"seed{seed}",
+            )
+            for seed in range(3)
+        ),
+        *(
+            # a table each: rows of tests do not say what was trained
+            Line(
+                f"sparse_particles_{encoder}",
+                f"filter.particles=8,32 seed={seed}",
+                SPARSE_RUN.format(folder, encoder, seed),
+                into=str(seed),
+            )
+            for encoder, folder in (("unet", "unet"), ("foveated", "others"), ("none", "others"))
+            for seed in range(3)
+        ),
+    ]
 
 
 def list_end_to_end() -> list[Line]:
@@ -280,6 +349,7 @@ def list_end_to_end() -> list[Line]:
                 Line(table, f"{parts}=short"),
                 Line(table, f"{parts}=resampled", into="parts"),
                 Line(table, f"{whole}=soft", into="whole"),
+                Line(table, f"{whole}=optimal_transport", into="transport"),
                 Line(table, f"{whole}=soft {WIDE}", into="wide"),
                 Line(table, both, into="both"),
             ]

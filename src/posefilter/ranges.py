@@ -232,6 +232,8 @@ RANGES: dict[str, Range] = {
     "levels": _whole(1, 64),
     "kernel": _whole(1, 1001),
     "max_width_px": _whole(16, MOST_SIDE),
+    "encoder.spacings_m": Range(0, 1, above=True, many=True),
+    "encoder.size": _whole(5, 64),
     "glimpse.size": _whole(1, 1024),
     "glimpse.spacing": Range(0, 1024, above=True),
     "likelihood.spread": POSITIVE,

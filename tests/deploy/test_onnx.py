@@ -332,11 +332,13 @@ def test_the_example_magnifies_as_torch_does(
     np.testing.assert_allclose(window["intrinsics"], view.intrinsics[0], rtol=1e-5)
 
 
+@pytest.mark.parametrize("encoder", ["unet", "foveated"])
 def test_a_filter_over_pixels_takes_the_same_steps(
-    pixels: ModuleType, tmp_path: Path, caplog: pytest.LogCaptureFixture
+    encoder: str, pixels: ModuleType, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     pytest.importorskip("onnxscript", reason="needs the extra export")
     method = make_pixel_method(
+        f"model/encoder={encoder}",
         *("filter/propagate=learned", "filter/resample=none", "filter/estimate=argmax"),
         *("filter.particles=12", "filter.steps=3", "data.image_width=96"),
     )

@@ -9,7 +9,13 @@ from torch import nn
 
 from posefilter.errors import UserError
 from posefilter.geometry.camera import intrinsics
-from posefilter.nets.encoders import NoEncoder, PyramidEncoder, ResNetEncoder, UNetEncoder
+from posefilter.nets.encoders import (
+    FoveatedEncoder,
+    NoEncoder,
+    PyramidEncoder,
+    ResNetEncoder,
+    UNetEncoder,
+)
 from posefilter.nets.resnet import ResNet
 
 K = intrinsics(150.0, 150.0, 79.5, 59.5)[None]
@@ -39,6 +45,80 @@ def test_no_context_is_empty() -> None:
     rgb, depth = scene()
     none = NoEncoder()
     assert none.sample_features(none(rgb, depth, K), torch.zeros(1, 7, 2)).shape == (1, 7, 0)
+
+
+def test_foveated_patches_read_only_the_pixels_that_they_say() -> None:
+    rgb, depth = scene()
+    torch.manual_seed(0)
+    fovea = FoveatedEncoder((0.01, 0.04)).double()
+    rgb, depth, camera = rgb.double(), depth.double(), K.double()
+    pixels = torch.tensor([[[80.3, 60.9], [5.0, 118.0], [-3.0, 40.0]]]).double()
+    with torch.no_grad():
+        maps = fovea(rgb, depth, camera)
+        before = fovea.sample_features(maps, pixels)
+        index, z = fovea.place_patches(maps, pixels)
+        u, v = index.flatten(0, 3).unbind(-1)
+        inside = (u >= 0) & (u < 160) & (v >= 0) & (v < 120)
+        read = torch.zeros(120, 160, dtype=torch.bool)
+        read[v[inside], u[inside]] = True
+        read[40, 0] = True  # by its depth the patches of the particle off the frame are placed
+        assert 2 * 49 < read.sum() < 3 * 2 * 49  # two particles read in the frame, one in part
+        others = fovea(torch.where(read, rgb, 0.5), torch.where(read, depth, 0.7), camera)
+        assert torch.equal(fovea.sample_features(others, pixels), before)
+        for n in range(3):
+            seen = index[0, n].flatten(0, 1)
+            u, v = seen[((seen >= 0) & (seen < torch.tensor([160, 120]))).all(-1)][0]
+            changed = rgb.clone()
+            changed[:, :, v, u] += 0.1
+            moved = fovea.sample_features(fovea(changed, depth, camera), pixels) != before
+            assert moved[0, n].any()
+    torch.testing.assert_close(z[0, :2], depth[0, 0, [61, 118], [80, 5]], atol=0, rtol=0)
+    assert z[0, 2] == depth[0, 0, 40, 0]  # off the frame, that of the nearest pixel
+
+
+def test_foveated_patches_cover_the_same_part_of_a_surface_at_any_distance_and_size() -> None:
+    fovea = FoveatedEncoder((0.01, 0.04), size=5)
+    pixels = torch.tensor([[[80.0, 60.0]]])
+
+    def spacings(depth: float, focal: float, size: tuple[int, int] = (120, 160)) -> list[int]:
+        z = torch.full((1, 1, *size), depth)
+        camera = intrinsics(focal, focal, 79.5, 59.5)[None]
+        index, _ = fovea.place_patches(fovea(torch.rand(1, 3, *size), z, camera), pixels)
+        steps = (index[0, 0, :, 1] - index[0, 0, :, 0])[:, 0]
+        return steps.tolist()
+
+    assert spacings(0.5, 150.0) == [3, 12]
+    assert spacings(1.0, 150.0) == [2, 6]  # 1.5 px, rounded for each pixel
+    assert spacings(1.0, 300.0, (240, 320)) == [3, 12]
+    assert spacings(5.0, 150.0) == [1, 1]  # never less than a pixel
+
+
+def test_foveated_patches_need_no_depth() -> None:
+    rgb, depth = scene()
+    fovea = FoveatedEncoder()
+    depth[:, :, 30:90, 40:120] = 0
+    pixels = torch.tensor([[[80.0, 60.0], [42.0, 60.0]]])
+    _, z = fovea.place_patches(fovea(rgb, depth, K), pixels)
+    known = depth[depth > 0]
+    assert z[0, 0] == known.median()
+    near = depth[0, 0, 57:64, 39]  # what is known within 3 px
+    torch.testing.assert_close(z[0, 1], near.mean(), atol=1e-4, rtol=0)
+    nothing = fovea.sample_features(fovea(rgb, torch.zeros_like(depth), K), pixels)
+    assert nothing.shape == (1, 2, fovea.width)
+    assert nothing.isfinite().all()
+
+
+@pytest.mark.parametrize(
+    ("more", "told"),
+    [
+        ({"spacings_m": ()}, r"model.encoder.spacings_m=\[\]: each must be positive, and one is"),
+        ({"spacings_m": (0.01, 0.0)}, r"model.encoder.spacings_m=\[0.01, 0.0\]"),
+        ({"size": 4}, "model.encoder.size=4: must be 5 or more"),
+    ],
+)
+def test_foveated_patches_that_are_none_are_refused(more: dict, told: str) -> None:
+    with pytest.raises(UserError, match=told):
+        FoveatedEncoder(**more)
 
 
 @pytest.mark.parametrize(

@@ -6,6 +6,7 @@ each particle.
 """
 
 import math
+from collections.abc import Sequence
 from typing import ClassVar, NamedTuple
 
 import torch
@@ -15,8 +16,9 @@ from torch import Tensor, nn
 from posefilter.capabilities import Capabilities
 from posefilter.errors import UserError
 from posefilter.geometry.camera import resize_intrinsics
-from posefilter.geometry.lookup import patch_offsets, sample
+from posefilter.geometry.lookup import gather_pixels, nearest_pixel, patch_offsets, sample
 from posefilter.nets.encoding import UNet, geometry, in_bfloat16, masked_mean_pool, upsample_like
+from posefilter.nets.heads import fill_depth
 from posefilter.nets.layers import ResBlock
 
 
@@ -92,6 +94,90 @@ class PyramidEncoder(nn.Module):
             values = sample(level, positions.flatten(1, 2), stride)
             features.append(values.unflatten(1, positions.shape[1:3]).flatten(2))
         return torch.cat(features, dim=-1)
+
+
+class FoveatedEncoder(nn.Module):
+    """Single pixels about a particle, in square patches of growing spacing, a small convolutional
+    network for each; nothing else of the image is read, and no network runs over it.
+
+    It is the retina-like sensor of recurrent attention (Mnih et al. 2014), with two differences:
+    coarse patches read single pixels where that sensor averages over blocks, which would read the
+    whole image; and spacings are metric, by the depth at the particle, so that a patch covers the
+    same part of the object at any distance and in images of any size.
+
+    Args:
+        spacings_m: Distance of neighboring pixels of each patch, at the depth of the particle [m].
+        size: Pixels along a side of each patch, 5 or more.
+        width: Features of a particle.
+
+    Raises:
+        UserError: A spacing is not positive, there is none, or `size` is below 5.
+    """
+
+    def __init__(
+        self,
+        spacings_m: Sequence[float] = (0.008, 0.024, 0.072),
+        size: int = 7,
+        width: int = 128,
+    ) -> None:
+        super().__init__()
+        if not spacings_m or min(spacings_m) <= 0:
+            raise UserError(
+                f"model.encoder.spacings_m={list(spacings_m)}: each must be positive, and one is "
+                "needed; choose model/encoder=none for none"
+            )
+        if size < 5:
+            raise UserError(f"model.encoder.size={size}: must be 5 or more, for two convolutions")
+        self.spacings_m, self.size, self.width = tuple(map(float, spacings_m)), size, width
+        self.patches = nn.ModuleList(
+            nn.Sequential(
+                nn.Conv2d(5, 32, 3), nn.ReLU(), nn.Conv2d(32, 64, 3), nn.ReLU(), nn.Flatten()
+            )
+            for _ in spacings_m
+        )
+        self.join = nn.Linear(len(self.spacings_m) * 64 * (size - 4) ** 2, width)
+
+    def forward(self, rgb: Tensor, depth: Tensor, K: Tensor) -> ContextMap:
+        """Return the image itself, color and depth, and with unknown depth filled: depth [m], and
+        how many pixels a meter has at it.
+        """
+        near = fill_depth(depth)
+        scale = torch.cat([near, K[:, 0, 0, None, None, None] / near], dim=1)
+        return ContextMap((torch.cat([rgb * 2 - 1, depth], dim=1), scale), (1, 1), None)
+
+    def place_patches(self, maps: ContextMap, pixels: Tensor) -> tuple[Tensor, Tensor]:
+        """Return which pixels are read, and the depth at each particle; a particle off the frame
+        has that of the nearest pixel in it.
+
+        (B, N, 2) [px] -> (B, N, S, size * size, 2) int64, (B, N) [m].
+        """
+        height, width = maps.levels[1].shape[-2:]
+        corner = torch.tensor([width - 1, height - 1], device=pixels.device)
+        inside = torch.minimum(nearest_pixel(pixels).clamp_min(0), corner)
+        depth, scale = gather_pixels(maps.levels[1], inside).unbind(-1)
+        # neighbors that are closer than a pixel would be the same one
+        spacings = (scale[..., None] * scale.new_tensor(self.spacings_m)).clamp_min(1.0)
+        offsets = patch_offsets(self.size, pixels.device) * spacings[..., None, None]
+        return nearest_pixel(pixels[:, :, None, None] + offsets), depth
+
+    def sample_features(self, maps: ContextMap, pixels: Tensor) -> Tensor:
+        """Compute features, without a gradient of the position.
+
+        (B, N, 2) [px] -> (B, N, width).
+        """
+        index, depth = self.place_patches(maps, pixels)
+        values = gather_pixels(maps.levels[0], index.flatten(1, 3)).unflatten(1, index.shape[1:4])
+        color, near = values.split([3, 1], dim=-1)  # zero off the frame
+        known = (near > 0).to(near)
+        # by the patch's half width, so that a slope looks the same in every patch
+        half = near.new_tensor(self.spacings_m)[:, None, None] * (self.size // 2)
+        relative = ((near - depth[..., None, None, None]) / half).clamp(-3, 3) * known
+        seen = torch.cat([color, relative, known], dim=-1).flatten(0, 1)
+        seen = seen.permute(1, 0, 3, 2).unflatten(3, (self.size, self.size))
+        with in_bfloat16(color):
+            parts = [net(one) for net, one in zip(self.patches, seen, strict=True)]
+            joined = self.join(torch.cat(parts, dim=-1))
+        return joined.to(color.dtype).unflatten(0, pixels.shape[:2])
 
 
 class _Encoder(nn.Module):
