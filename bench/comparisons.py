@@ -16,9 +16,9 @@ own folder.
 
 import json
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -192,11 +192,17 @@ def estimate_minutes(piece: Piece, model: str) -> float:
     return len(piece.seeds) * len(piece.sizes) * each / 60
 
 
+def list_choices(metrics: Mapping[str, Any]) -> dict[str, str]:
+    """Return what was chosen on the command line of a run, by key."""
+    words = [word.lstrip("+") for word in metrics["overrides"]]
+    return dict(word.split("=", 1) for word in words if "=" in word)
+
+
 def find_runs(root: Path) -> Iterator[Run]:
     """Yield each finished run."""
     for file in sorted((HOME / root).glob("*/metrics.json")):
         metrics = json.loads(file.read_text())
-        typed = dict(text.split("=", 1) for text in metrics["overrides"] if "=" in text)
+        typed = list_choices(metrics)
         if "data.limit_train" in typed:
             folder, size = file.parent.relative_to(HOME), int(typed["data.limit_train"])
             yield Run(folder, metrics["model"], size, int(metrics["seed"]))

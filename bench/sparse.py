@@ -2,11 +2,12 @@
 
     python bench/sparse.py [--images 20]
 
-The runs are those of `python bench/methods.py --only sparse`. Accuracy is over all images of their
+The runs are those of `python bench/methods.py --only sparse`, and of `sparse_particles_unet`, ...
+for fewer particles. Accuracy is over all images of their
 tests, and its interval over scenes and seeds; pixels and operations are counted on the first
 `--images` of them, with the weights of one seed. A pixel counts as read if the network over the
-image reads it, or if it lies under the patches of a particle in any step. Writes the table of
-docs/results/sparse.md.
+image reads it, or if it lies under the patches of a particle in any step. Writes the tables
+of docs/results/sparse.md.
 """
 
 from copy import deepcopy
@@ -16,7 +17,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 from batches import list_counts
-from comparisons import bootstrap, measure_recall
+from comparisons import bootstrap, list_choices, measure_recall
 from marked import format_row, put_table
 from programs import HOME, make_parser
 from torch.utils.data import default_collate
@@ -45,10 +46,7 @@ NAMES = {  # what is chosen, and how the table has it
 }
 PARTICLES = 128  # the preset's
 CHOICES = ("model/encoder", "model.encoder.max_width_px", "data.image_width")
-
-
 ENCODERS = ("unet", "foveated", "none")  # that are tested with fewer particles
-FEW = ("network over the image", "foveated patches", "a particle's own patch alone")
 
 
 class Kind(NamedTuple):
@@ -76,7 +74,7 @@ def find_kinds(root: Path) -> list[Kind]:
         metrics = read_json(file)
         run = Path(metrics["checkpoint"]).parents[1]
         run = run if run.is_absolute() else HOME / run
-        trained, typed = (read_choices(one) for one in (run / file.name, file))
+        trained, typed = (list_choices(one) for one in (read_json(run / file.name), metrics))
         name = NAMES[*(trained.get(key, "") for key in CHOICES)]
         particles = int(typed.get("filter.particles", PARTICLES))
         kind = found.setdefault((name, particles), Kind(name, particles, [], []))
@@ -84,12 +82,6 @@ def find_kinds(root: Path) -> list[Kind]:
         kind.runs.append(run)
     names = list(NAMES.values())
     return sorted(found.values(), key=lambda kind: (names.index(kind.name), -kind.particles))
-
-
-def read_choices(file: Path) -> dict[str, str]:
-    """Return what was chosen on the command line of a run, by key."""
-    words = [word.lstrip("+") for word in read_json(file)["overrides"]]
-    return dict(word.split("=", 1) for word in words if "=" in word)
 
 
 def load(run: Path, images: int) -> tuple[ImageSpace, list[Batch]]:
@@ -115,8 +107,8 @@ def count_pixels(method: ImageSpace, batch: Batch, steps: list[Any]) -> int:
     read = torch.zeros(height, width, dtype=torch.bool)
     own = patch_offsets(method.glimpse.size)
     for encoding, state in steps:
-        corner = state.floor().long()  # a sample between pixels is a mean of four
-        corners = torch.stack([corner + patch_offsets(2)[i] for i in range(4)], dim=2)
+        # a sample between pixels is a mean of four
+        corners = state.floor().long()[:, :, None] + patch_offsets(2)
         places = [(corners[:, :, :, None] + own).flatten(1, 3)]
         if isinstance(method.encoder, FoveatedEncoder):
             index, _ = method.encoder.place_patches(encoding.context, state)
@@ -176,10 +168,10 @@ def main() -> None:
     page = PAGE.read_text()
     head = ["ADD AUC", "ADD < 0.1 d %", "pixels read", "of the image"]
     head += ["10⁹ operations: network over the image", "all particles"]
-    for title, names, few in (("sparse", [*NAMES.values()], False), ("few", FEW, True)):
+    for title, few in (("sparse", False), ("few", True)):
         rows = []
         for kind in kinds:
-            if kind.name in names and (kind.particles != PARTICLES) == few:
+            if (kind.particles != PARTICLES) == few:
                 rows.append(describe(kind, options.images))
                 print(rows[-1], flush=True)
         more = ["", "particles"] if few else [""]

@@ -1,8 +1,8 @@
 """Find trained weights by path or by name, and fetch those that are elsewhere."""
 
 import difflib
+import io
 import os
-import threading
 from collections.abc import Iterable, Sequence
 from fnmatch import fnmatch
 from pathlib import Path
@@ -10,6 +10,7 @@ from typing import Any
 from urllib.parse import urlparse
 
 from posefilter.errors import UserError, find_reason
+from posefilter.files import write_whole
 from posefilter.paths import is_plain_name
 
 # the address of a folder of weights with a registry.txt: lines of `<name>.ckpt sha256:<digest>`
@@ -122,15 +123,14 @@ def _fetch_registry(loader: Any, url: str, index: Path, wanted: Path) -> None:
     """
     import requests
 
-    part = index.with_name(f".{index.name}.{os.getpid()}.{threading.get_ident()}.part")
+    content = io.BytesIO()
     try:
-        loader(url + _REGISTRY, str(part), None)
-        part.replace(index)
+        loader(url + _REGISTRY, content, None)
     except (requests.ConnectionError, requests.Timeout):
         if not (wanted.is_file() and index.is_file()):
             raise
-    finally:
-        part.unlink(missing_ok=True)
+    else:
+        write_whole(index, content.getvalue())
 
 
 def fetch_weights(name: str, url: str, cache: Path | None = None) -> Path:

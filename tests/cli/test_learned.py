@@ -8,8 +8,7 @@ import pytest
 from tests.data.dataset_trees import bop_scene, pose
 
 from posefilter.cli import run_command
-from posefilter.cli.evaluate import warn_of_learned
-from posefilter.cli.learned import list_learned
+from posefilter.cli.learned import list_learned, warn_of_learned
 from posefilter.cli.train import check_scenes
 from posefilter.data.module import PoseDataModule
 from posefilter.data.splits import find_learned

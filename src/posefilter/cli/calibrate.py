@@ -16,11 +16,11 @@ from torch import Tensor
 from posefilter.cli.build import build_data
 from posefilter.cli.checkpoints import find_checkpoint, method_of, read_checkpoint
 from posefilter.cli.components import changes
-from posefilter.cli.console import JSON, ended, say, show_table, typed, typed_prediction, warn
+from posefilter.cli.console import JSON, ended, say, show_table, typed, typed_prediction
 from posefilter.cli.evaluate import data_settings
 from posefilter.cli.files import save_whole
 from posefilter.cli.job import Job
-from posefilter.cli.learned import DATA, list_learned
+from posefilter.cli.learned import warn_of_learned
 from posefilter.cli.machine import settle
 from posefilter.confidence.belief_scale import (
     FEWEST_RIGHT,
@@ -91,14 +91,7 @@ def calibrate(job: Job) -> None:
     settings.limit_val = cfg.frames
     data = build_data(settings, cfg.console, job.overrides)
     data.setup("validate")
-    learned = list_learned(file.parent.parent / DATA, data, "val")
-    if learned:
-        sentence = (
-            f"{len(learned)} of the scenes that are calibrated on were learned from by this run "
-            f"({', '.join(learned[:3])}), so that probabilities will be too high: the dataset or "
-            "data.split has changed since"
-        )
-        warn(cfg.console, sentence, learned=learned)
+    warn_of_learned(str(file), data, cfg.console, "val")
     without = cfg.frames if cfg.absent_frames is None else cfg.absent_frames
     absent = [data.absent_dataset("val", without)]
     if cfg.absent is not None and len(absent[0]) < without:

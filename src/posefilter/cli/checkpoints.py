@@ -188,7 +188,7 @@ def is_calibrated_filter(settings: dict[str, Any], calibrated: dict[str, Any]) -
 
 
 def check_once(objects: Sequence[str]) -> None:
-    """Raise UserError where two checkpoints are of one object: its name tells answers apart."""
+    """Raise UserError where two checkpoints are of one object: answers go by its name."""
     name, count = Counter(objects).most_common(1)[0]
     if count > 1:
         raise UserError(

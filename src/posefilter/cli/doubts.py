@@ -8,6 +8,11 @@ from posefilter.cli.console import warn
 from posefilter.result import Result
 
 
+def _drop_numbers(text: str) -> str:
+    """Return what kind of reason a text is of: numbers do not tell kinds apart."""
+    return re.sub(r"[\d.]+", "", text)
+
+
 def say_doubt(result: Result, image: str, warned: set[str], console: str, **facts: Any) -> None:
     """Warn of a result whose depth or intrinsics must be wrong, or whose image cannot be judged.
 
@@ -18,8 +23,7 @@ def say_doubt(result: Result, image: str, warned: set[str], console: str, **fact
         console: Where to.
         facts: More, for machines.
     """
-    # a reason's numbers are another in each image
-    doubt = re.sub(r"[\d.]+", "", result.blank) or (result.object if result.wrong_size else "")
+    doubt = _drop_numbers(result.blank) or (result.object if result.wrong_size else "")
     if doubt and doubt not in warned:
         warned.add(doubt)
         facts |= {"object": result.object, "warnings": list(result.warnings)}
@@ -42,7 +46,7 @@ def say_commonest(
     """
     kinds: dict[str, list[str]] = {}
     for warning in warnings:
-        kinds.setdefault(re.sub(r"[\d.]+", "", warning), []).append(warning)
+        kinds.setdefault(_drop_numbers(warning), []).append(warning)
     if most := max(kinds.values(), key=len, default=None):
         said, facts = f"{name} {where}; in {len(most)} of {images} {most[0]}", {unit: len(most)}
         warn(console, said, object=name, **facts, reason=most[0])

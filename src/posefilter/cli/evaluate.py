@@ -15,12 +15,12 @@ from posefilter.callbacks.errors import ErrorTable, make_rows
 from posefilter.callbacks.records import Records, to_rows, write_beliefs
 from posefilter.cli.bop_scores import assign_estimates, score_targets, sort_rows
 from posefilter.cli.build import build_data, make_trainer, quiet
-from posefilter.cli.checkpoints import find_checkpoint, method_of, read_checkpoint
+from posefilter.cli.checkpoints import method_of, read_checkpoint
 from posefilter.cli.components import changed, changes, chosen
 from posefilter.cli.console import typed, warn
 from posefilter.cli.folders import keep_training_results, read_results
 from posefilter.cli.job import Job
-from posefilter.cli.learned import DATA, list_learned
+from posefilter.cli.learned import warn_of_learned
 from posefilter.cli.machine import settle
 from posefilter.cli.plain import to_plain
 from posefilter.cli.progress_bar import progress
@@ -121,17 +121,6 @@ def _of_checkpoint(job: Job) -> tuple[dict[str, Any], dict[str, Path]]:
     source = Path(job.cfg.checkpoint)
     found = record(method.compute_metrics(), tested, data.describe(), source, device)
     return found, files
-
-
-def warn_of_learned(checkpoint: str, data: PoseDataModule, console: str) -> None:
-    """Say where test scenes are of those that the checkpoint's run has learned from."""
-    learned = list_learned(find_checkpoint(checkpoint).parent.parent / DATA, data)
-    if learned:
-        sentence = (
-            f"{len(learned)} of the scenes that are tested were learned from by this run "
-            f"({', '.join(learned[:3])}): the dataset or data.split has changed since"
-        )
-        warn(console, sentence, learned=learned)
 
 
 def warn_of_several(data: PoseDataModule, console: str) -> None:

@@ -70,7 +70,7 @@ class Lines(Callback):
         self._last, self._steps, self._done = self._began, count_steps(trainer), None
 
     def on_train_batch_start(self, trainer: Trainer, pl_module: LightningModule, *_: Any) -> None:
-        """Note what is done: by then the time budget has said it, in whatever order both come."""
+        """Note the share that is done; the time budget, too, knows it by then."""
         if self._done is None and self._steps is not None:
             self._done = measure_done(trainer, pl_module, self._steps)
 
@@ -127,12 +127,14 @@ class Bars(Callback):
     def __init__(self) -> None:
         self._bars: Progress | None = None
         self._training: TaskID | None = None
+        self._steps: int | None = None
         self._looking: TaskID | None = None
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Open the bar."""
+        self._steps = count_steps(trainer)
         self._training = self._shown().add_task(
-            "training", total=count_steps(trainer), completed=trainer.global_step, said=""
+            "training", total=self._steps, completed=trainer.global_step, said=""
         )
 
     def on_train_batch_end(self, trainer: Trainer, pl_module: LightningModule, *_: Any) -> None:
@@ -143,9 +145,9 @@ class Bars(Callback):
         every: int = trainer.log_every_n_steps  # type: ignore[attr-defined]
         if trainer.global_step % every == 0 or trainer.global_step == trainer.max_steps:
             said = {"said": briefly(trainer.callback_metrics)}
-        steps, step = count_steps(trainer), trainer.global_step
-        if steps is not None:
-            step = round(steps * measure_done(trainer, pl_module, steps))
+        step = trainer.global_step
+        if self._steps is not None:
+            step = round(self._steps * measure_done(trainer, pl_module, self._steps))
         self._shown().update(self._training, completed=step, **said)
 
     def on_validation_start(self, trainer: Trainer, pl_module: LightningModule) -> None:

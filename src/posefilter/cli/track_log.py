@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from posefilter.cli.console import finite
+from posefilter.cli.folders import holds_run
 from posefilter.errors import UserError
 from posefilter.files import GrowingFile
 from posefilter.metrics.bop_results import HEADER, PoseRow, choose_score, format_pose_row, to_native
@@ -81,7 +82,7 @@ def check_unused(folder: Path) -> None:
     """
     if (folder / POSES).is_file():
         raise UserError(f"out={folder}: holds tracks already; choose another folder: out=DIR")
-    if (folder / "metrics.json").is_file() or (folder / "checkpoints").is_dir():
+    if holds_run(folder):
         raise UserError(f"out={folder}: holds a run; choose another folder: out=DIR")
     lines, poses = folder / _LINES, folder / _CSV
     if os.path.lexists(lines) or os.path.lexists(poses):

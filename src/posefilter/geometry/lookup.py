@@ -19,6 +19,15 @@ def nearest_pixel(pixels: Tensor) -> Tensor:
     return (pixels.detach() + 0.5).floor().clamp(-1e6, 1e6).long()
 
 
+def nearest_inside(pixels: Tensor, height: int, width: int) -> Tensor:
+    """Return the nearest whole pixel of the frame to each position.
+
+    (*, 2) [px] -> (*, 2) int64.
+    """
+    corner = torch.tensor([width - 1, height - 1], device=pixels.device)
+    return torch.minimum(nearest_pixel(pixels).clamp_min(0), corner)
+
+
 def gather_pixels(image: Tensor, index: Tensor) -> Tensor:
     """Gather whole pixels, zero outside the frame.
 

@@ -14,7 +14,7 @@ from posefilter.capabilities import Capabilities
 from posefilter.errors import UserError
 from posefilter.filters.loop import ParticleFilter
 from posefilter.geometry.camera import back_project
-from posefilter.geometry.lookup import gather_pixels, nearest_pixel
+from posefilter.geometry.lookup import gather_pixels, nearest_inside, nearest_pixel
 from posefilter.geometry.spaces import PixelSpace
 from posefilter.models.base import PoseEstimator
 from posefilter.models.box_heads import BoxHead
@@ -178,13 +178,10 @@ class ImageSpace(PoseEstimator):
         Returns:
             Points in the camera (B, N, 3) [m], and whether their depth was measured (B, N) bool.
         """
-        H, W = encoding.depth.shape[-2:]
-        corner = torch.tensor([W - 1, H - 1], device=state.device)
-        pixel = nearest_pixel(state)
-        inside = torch.minimum(pixel.clamp_min(0), corner)
+        inside = nearest_inside(state, *encoding.depth.shape[-2:])
         z, measured = gather_pixels(encoding.depth, inside).unbind(-1)
         return back_project(state.detach(), z, encoding.intrinsics), (measured > 0) & (
-            inside == pixel
+            inside == nearest_pixel(state)
         ).all(-1)
 
     def image_patches(self, encoding: ImageEncoding, state: Tensor) -> Tensor:

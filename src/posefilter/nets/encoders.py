@@ -16,7 +16,13 @@ from torch import Tensor, nn
 from posefilter.capabilities import Capabilities
 from posefilter.errors import UserError
 from posefilter.geometry.camera import resize_intrinsics
-from posefilter.geometry.lookup import gather_pixels, nearest_pixel, patch_offsets, sample
+from posefilter.geometry.lookup import (
+    gather_pixels,
+    nearest_inside,
+    nearest_pixel,
+    patch_offsets,
+    sample,
+)
 from posefilter.nets.encoding import UNet, geometry, in_bfloat16, masked_mean_pool, upsample_like
 from posefilter.nets.heads import fill_depth
 from posefilter.nets.layers import ResBlock
@@ -151,9 +157,7 @@ class FoveatedEncoder(nn.Module):
 
         (B, N, 2) [px] -> (B, N, S, size * size, 2) int64, (B, N) [m].
         """
-        height, width = maps.levels[1].shape[-2:]
-        corner = torch.tensor([width - 1, height - 1], device=pixels.device)
-        inside = torch.minimum(nearest_pixel(pixels).clamp_min(0), corner)
+        inside = nearest_inside(pixels, *maps.levels[1].shape[-2:])
         depth, scale = gather_pixels(maps.levels[1], inside).unbind(-1)
         # neighbors that are closer than a pixel would be the same one
         spacings = (scale[..., None] * scale.new_tensor(self.spacings_m)).clamp_min(1.0)

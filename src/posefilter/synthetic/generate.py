@@ -175,7 +175,7 @@ def generate(
     finally:
         if held:
             release(out)
-    there = [path.parent for path in out.glob("mixed/*/[0-9]*.left.json")]  # of earlier runs too
+    there = [path.parent for path in _list_rendered(out)]  # of earlier runs too
     seconds = time.perf_counter() - began
     return Summary(out, len(there), len(todo), len(set(there)), seconds)
 
@@ -200,6 +200,11 @@ def list_changed(out: Path, **settings: Any) -> list[str]:
     bound.apply_defaults()
     names = _list_differing(record.settings, _describe(_make_job(bound.arguments)))
     return _as_typed([*names, *(["frames"] if record.frames != settings["frames"] else [])])
+
+
+def _list_rendered(out: Path) -> list[Path]:
+    """Return the label file of each frame that a dataset holds."""
+    return list(out.glob("mixed/*/[0-9]*.left.json"))
 
 
 def shows_another_mesh(out: Path, store: MeshStore, name: str) -> bool:
@@ -380,8 +385,7 @@ def _open_dataset(out: Path, job: Job, frames: int, mesh: str | None) -> None:
                 "changed since; choose another out="
             )
         else:
-            there = sum(1 for _ in out.glob("mixed/*/[0-9]*.left.json"))
-            frames, mesh = max(frames, there), mesh or record.mesh
+            frames, mesh = max(frames, len(_list_rendered(out))), mesh or record.mesh
         remove_parts(out, [".", "mixed/*"])
     elif out.is_dir() and any(path.name != LOCK for path in out.iterdir()):
         raise UserError(
