@@ -35,6 +35,14 @@ TELLING = (
     "c6_position,c9_context,pose_c12_loss,working"
 )
 TELLING_BOX = "s2_bounded,c1_normalization,c6_position"
+# the paper with one modification, and the first two of the ladder: the others bound displacements
+UNBOUNDED = (
+    "s1_glimpse,s3_balanced,s4_displacement_loss,s5_position,s6_informed,s7_context,s8_resample,"
+    "s9_displacement_loss_and_position,c1_normalization,c2_glimpse"
+)
+UNBOUNDED_BOX = (
+    "s1_glimpse,s4_displacement_loss,s7_context,box_s10_steps,c1_normalization,c2_glimpse"
+)
 SHIPPED = "weights/003_cracker_box.ckpt"  # of pose_pf
 MEMORISED = "memorize/experiment=memorize,model={},seed=0,variant=working"
 HELD_OUT = "held_out/model={},seed=0"
@@ -46,10 +54,11 @@ POSE_RUN = "ablation_pose_pf/ablation={},model=pose_pf,seed=0,sweep=ablation_pos
 # the paper's variant small enough for many rows; detectors at the unit at which they gain, since
 # where nothing works no choice can tell
 SMALL = "model={} experiment=memorize sweep=ablation ablation=paper callbacks=checkpoints"
-SMALL_BOX = (
-    "model=downsized experiment=memorize sweep=ablation_detect ablation=paper filter.particles=8 "
+SMALL_BOXES = (
+    "model={} experiment=memorize sweep=ablation_detect ablation={} filter.particles=8 "
     "model.net.width=16 callbacks=checkpoints"
 )
+SMALL_BOX = SMALL_BOXES.format("downsized", "paper")
 POSE = "model=pose_pf data/augment=strong seed=0"  # its row is of the default of that time
 # no loss on a part: the pose's head has no fragments, whose choice passes no gradient
 END_TO_END = (
@@ -153,7 +162,7 @@ def plan(meshes: str | None = None, frames: str | None = None) -> list[Line]:
         Line("patch", "model=patch_pf experiment=memorize sweep=patch seed=0"),
     ]
     lines += [*list_pose_space(), *list_paper(), *list_choices(), *list_long()]
-    lines += [*list_units_at_full_size(), *list_sparse()]
+    lines += [*list_units_at_full_size(), *list_units_of_ablations(), *list_sparse()]
     if meshes:
         box = f"{FOUR} experiment=cracker_box_pixels data.meshes={meshes} seed=0"
         lines.append(Line("cracker_box", box))
@@ -270,6 +279,41 @@ def list_units_at_full_size() -> list[Line]:
     return lines
 
 
+def list_units_of_ablations() -> list[Line]:
+    """Return the ablations whose displacement has a unit, for 1 and 10 pixels besides half a frame;
+    and bounds apart from the unit, whose step is also that of the unbounded one at 10 pixels.
+    """
+    seeds = "seed=0,1,2"
+    others = ",".join(name for name in UNBOUNDED.split(",") if name not in TELLING.split(","))
+    lines = []
+    for model in WITH_POSE:
+        some = f"model={model} experiment=memorize sweep=ablation callbacks=checkpoints"
+        lines += [
+            Line(
+                "ablation_unit",
+                f"{some} ablation={UNBOUNDED} model.displacement.unit=1,10 {seeds}",
+                into=model,
+            ),
+            Line("ablation", f"{some} ablation={others} seed=1,2", into=f"{model}_more_seeds"),
+        ]
+    for model in DETECTORS:
+        bounded = SMALL_BOXES.format(model, "s2_bounded")
+        unbounded = SMALL_BOXES.format(model, UNBOUNDED_BOX)
+        lines += [
+            Line(
+                "bounded_unit",
+                f"{bounded} model.displacement.max_displacement=0.5,0.25,0.03125 {seeds}",
+                into=model,
+            ),
+            Line(
+                "ablation_detect_unit",
+                f"{unbounded} model.displacement.unit=half_frame,1,10 {seeds}",
+                into=model,
+            ),
+        ]
+    return lines
+
+
 def list_sparse() -> list[Line]:
     """Return patch_pf on held-out scenes with less and less of the image besides a particle's own
     patch, for half the preset's steps; and for the first of these runs guided starts and
@@ -287,6 +331,8 @@ def list_sparse() -> list[Line]:
         Line("sparse", f"{patch} model/encoder=foveated,none,pyramid {seeds}", into="others"),
         Line("sparse", f"{unet} model.encoder.max_width_px=80,40 {seeds}", into="narrow"),
         Line("sparse", f"{patch} model/encoder=foveated data.image_width=320 {seeds}", into="wide"),
+        # against the first line
+        Line("stages", f"{unet} loss/schedule=three_stages {seeds}"),
         *(
             # the row of a test has the seed of its draws: that of the training as well
             Line(
