@@ -247,7 +247,7 @@ RANGES: dict[str, Range] = {
     "candidate_sampler.sigma_levels": _whole(2, 1000),
     "candidate_sampler.persistent_sigma_probability": SHARE,
     "candidate_sampler.sigma_range": Range(0, 100, above=True, many=True),
-    "box_head.quantile": SHARE,
+    "box_head.quantile": Range(0, 0.5),
     "model.cells": _whole(3, 1_000_000),
     "model.inlier": POSITIVE,
     "model.refits": _whole(0, 1000),

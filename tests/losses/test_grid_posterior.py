@@ -58,6 +58,27 @@ def test_a_gaussian_about_the_truth_costs_nothing_and_all_else_its_divergence(
     assert math.isclose(flat, math.log(200) - entropy, rel_tol=1e-6)
 
 
+def test_a_symmetry_about_another_point_than_the_center_moves_it(batch, model) -> None:
+    """As of a prism of three sides, whose box's center is not on its axis."""
+    turn = exp_so3(torch.tensor([0.0, 0.0, 2 * math.pi / 3], dtype=torch.float64))
+    third = make_pose(turn, torch.zeros(3, dtype=torch.float64))
+    center = torch.tensor([0.03, 0.0, 0.0], dtype=torch.float64)
+    model = model._replace(
+        center=center, symmetries=torch.stack([torch.eye(4).double(), third, third @ third])
+    )
+    equal = batch.camera_from_object[0] @ third
+    place = equal[:3, :3] @ center + equal[:3, 3]
+    rotation = look_at(place[None, None])[0, 0].mT @ equal[:3, :3]
+    far = squared_distances(place[None, None], rotation[None], batch.camera_from_object[:1], model)
+    assert float(far) < 1e-12
+
+
+def test_an_image_without_the_object_teaches_nothing(batch, model, make_trace) -> None:
+    scores = torch.randn(1, 5, 40, generator=G, dtype=torch.float64)
+    away = batch._replace(mask=torch.zeros_like(batch.mask))
+    assert loss_of(scores, away, model, make_trace) == 0 < loss_of(scores, batch, model, make_trace)
+
+
 def test_a_pose_that_a_symmetry_makes_equal_is_as_right(batch, model, make_trace) -> None:
     turn = exp_so3(torch.tensor([0.0, 0.0, math.pi], dtype=torch.float64))
     half = make_pose(turn, torch.zeros(3, dtype=torch.float64))

@@ -38,6 +38,16 @@ def thick() -> ObjectModel:
     return square()._replace(hull=hull)
 
 
+def test_keypoints_of_a_flat_object_are_refused() -> None:
+    """Of corners in a plane EPnP finds some pose, and not the right one."""
+    method = make("keypoints")
+    flat = thick()
+    flat = flat._replace(hull=flat.hull * torch.tensor([1.0, 1.0, 1e-4]), name="card")
+    with pytest.raises(UserError, match="model=keypoints: card is flat"):
+        method.set_object(flat)
+    method.set_object(thick())
+
+
 def make(kind: str, seed: int = 0) -> Hypotheses:
     torch.manual_seed(seed)
     pieces = (

@@ -31,6 +31,22 @@ def test_a_step_has_the_given_size_whatever_the_gradient() -> None:
         assert 0.8 * 0.2 * 0.01 < moved < 1.1 * 0.2 * 0.01
 
 
+def test_a_zero_gradient_moves_no_matrix() -> None:
+    """As of a loss whose weight is 0 in a stage of the training: the momentum that is left would be
+    a step of full size.
+    """
+    torch.manual_seed(0)
+    idle, busy = (torch.nn.Parameter(torch.randn(6, 8)) for _ in range(2))
+    muon = Muon([("a.mid.weight", idle), ("b.mid.weight", busy)], lr=0.01)
+    idle.grad, busy.grad = torch.randn(6, 8), torch.randn(6, 8)
+    muon.step()
+    before = [p.detach().clone() for p in (idle, busy)]
+    idle.grad = torch.zeros(6, 8)
+    muon.step()
+    assert torch.equal(idle, before[0])
+    assert not torch.equal(busy, before[1])
+
+
 def test_vectors_and_spared_layers_take_adamws_step() -> None:
     torch.manual_seed(0)
     start = {

@@ -46,6 +46,28 @@ def test_a_plain_state_passes_unchanged() -> None:
         assert torch.equal(value, state[name])
 
 
+def test_points_far_from_the_origin_come_back_as_well_as_those_about_it() -> None:
+    """As of a mesh that was scanned in a room's frame."""
+    center, look = torch.tensor([3.0, -5.0, 1.0]), torch.rand(300, 3)
+    points = 0.1 * torch.randn(300, 3)
+    plain = {
+        **square()._asdict(),
+        "center": center,
+        "points": center + points,
+        "texture": torch.cat(
+            [center + points, torch.nn.functional.normalize(look, dim=1), look], 1
+        ),
+    }
+    packed = pack_object(plain)
+    assert pack_object(packed)["points"].equal(packed["points"])
+    after = unpack_object(packed)
+    assert after.texture is not None
+    for found in (after.points, after.texture[:, :3].float()):
+        assert (found - center - points).abs().max() < 2e-4
+    again = unpack_object(pack_object(after._asdict()))
+    assert (again.points - center - points).abs().max() < 4e-4
+
+
 def test_surface_points_come_back_to_a_ten_thousandth_and_the_rest_as_it_was() -> None:
     points = 0.1 * torch.randn(500, 3)
     texture = torch.rand(700, 9)

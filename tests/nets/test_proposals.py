@@ -8,7 +8,13 @@ from posefilter.geometry.camera import intrinsics, pixel_grid, rays
 from posefilter.geometry.fragments import nearest_fragment, sample_farthest_points
 from posefilter.geometry.pose import make_pose
 from posefilter.geometry.rotation import angle_between, exp_so3
-from posefilter.nets.coordinates import STRIDE, Cells, Coordinates, coordinate_loss
+from posefilter.nets.coordinates import (
+    STRIDE,
+    Cells,
+    Coordinates,
+    coordinate_loss,
+    true_coordinates,
+)
 from posefilter.nets.encoding import masked_mean_pool, normals_from_depth
 from posefilter.nets.pose_votes import draw_poses, measure_cells
 from posefilter.nets.proposals import ObjectCoordinateNet
@@ -63,6 +69,19 @@ def test_cells_lie_on_the_surface_and_skip_holes() -> None:
     assert not cells.valid[0, 1, 0]
     assert cells.valid.sum() == cells.valid.numel() - 1
     assert (cells.point[cells.valid] @ normal + 0.8).abs().max() < 1e-5
+
+
+def test_a_cell_on_the_object_is_lifted_from_a_pixel_on_the_object() -> None:
+    """Wherever the object's rim lies in a cell: what lies behind it is no point of the object."""
+    for shift in range(STRIDE):
+        mask = torch.zeros(1, 1, H, W, dtype=torch.bool)
+        mask[..., shift:24, shift:24] = True
+        cells = measure_cells(torch.where(mask, 0.8, 0.85), K)
+        pose = make_pose(torch.eye(3), torch.tensor([0.0, 0.0, 0.8]))[None]
+        _, on, usable = true_coordinates(cells, mask, pose, torch.zeros(3), 1.0)
+        assert on.any()
+        assert torch.equal(on, usable)
+        assert (cells.point[on][:, 2] - 0.8).abs().max() < 1e-6
 
 
 def world(noise: float = 0.0, doubt: float = 0.0) -> tuple[Coordinates, Cells, Tensor]:

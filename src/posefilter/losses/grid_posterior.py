@@ -20,12 +20,14 @@ def squared_distances(
 
     (B, C, 3) [m], (M, 3, 3), (B, 4, 4) -> (B, C, M) [m^2].
     """
-    shift = (centers - origin_of(truth, object_model.center.to(truth))[:, None]).square().sum(-1)
-    rotation = look_at(centers).mT @ rotation_of(truth)[:, None]
-    equivalent = rotation[:, :, None] @ rotation_of(object_model.symmetries.to(truth))
-    trace = torch.einsum("bcsij,mij->bcsm", equivalent, rotations).amax(2)
+    equivalent = truth[:, None] @ object_model.symmetries.to(truth)  # (B, S, 4, 4)
+    # a symmetry may move the center, which is that of a box
+    origin = origin_of(equivalent, object_model.center.to(truth))
+    shift = (centers[:, :, None] - origin[:, None]).square().sum(-1)
+    rotation = look_at(centers).mT[:, :, None] @ rotation_of(equivalent)[:, None]
+    trace = torch.einsum("bcsij,mij->bcsm", rotation, rotations)
     angle = ((trace - 1) / 2).clamp(-1, 1).acos()
-    return shift[..., None] + (object_model.radius * angle).square()
+    return (shift[..., None] + (object_model.radius * angle).square()).amin(2)
 
 
 class GridPosterior:
@@ -48,7 +50,7 @@ class GridPosterior:
         self.sigma = sigma
 
     def __call__(self, trace: Trace, batch: Batch, object_model: ObjectModel) -> Tensor:
-        """Return the loss of each image, (B,)."""
+        """Return the loss of each image, (B,); 0 of one that does not show the object."""
         encoding = trace.encoding
         distance = squared_distances(
             encoding.centers, encoding.rotations, batch.camera_from_object, object_model
@@ -56,4 +58,5 @@ class GridPosterior:
         log_kernel = -0.5 * distance / (self.sigma * object_model.radius) ** 2
         log_target = log_kernel.flatten(1).log_softmax(1)
         log_posterior: Tensor = encoding.scores.flatten(1).log_softmax(1)
-        return (log_target.exp() * (log_target - log_posterior)).sum(1)
+        divergence = (log_target.exp() * (log_target - log_posterior)).sum(1)
+        return divergence * batch.mask.flatten(1).any(1)

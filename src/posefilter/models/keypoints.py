@@ -13,6 +13,7 @@ import torch
 from torch import Generator, Tensor
 
 from posefilter.capabilities import Capabilities
+from posefilter.errors import UserError
 from posefilter.geometry.camera import rays
 from posefilter.geometry.keypoints import (
     KEYPOINTS,
@@ -25,9 +26,11 @@ from posefilter.geometry.lookup import sample
 from posefilter.geometry.pose import pose_about
 from posefilter.models.pose_particles import Hypotheses
 from posefilter.nets.heatmaps import STRIDE, HeatmapNet
-from posefilter.types import Batch
+from posefilter.types import Batch, ObjectModel
 
 _LEAST = 0.01  # height of a peak
+# of a box's longest side: thinner, EPnP fails on pixels that are off by a third of a pixel
+_FLAT = 0.01
 _FALLBACK = 1.0  # [m] depth of the center where no pose is found
 
 
@@ -73,6 +76,21 @@ class Keypoints(Hypotheses):
     ) -> None:
         super().__init__(**base)
         self.net, self.peaks, self.subset, self.inlier_px = net, peaks, subset, inlier_px
+
+    def set_object(self, object_model: ObjectModel) -> None:
+        """Set the object.
+
+        Raises:
+            UserError: It is flat: the corners of its box lie in a plane, from which EPnP finds no
+                pose.
+        """
+        extent = object_model.hull.amax(0) - object_model.hull.amin(0)
+        if float(extent.min()) < _FLAT * float(extent.max()):
+            raise UserError(
+                f"model=keypoints: {object_model.name} is flat, so that the corners of its box are "
+                "nearly in a plane, from which EPnP finds no pose; choose another model"
+            )
+        super().set_object(object_model)
 
     def encode(self, batch: Batch) -> KeypointEncoding:
         """Run the network."""

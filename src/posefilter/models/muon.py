@@ -75,7 +75,7 @@ class Muon(Optimizer):
 
     def _orthogonal_step(self, parameters: list[Tensor], group: dict[str, Any]) -> None:
         alike: dict[torch.Size, list[tuple[Tensor, Tensor]]] = {}
-        for p in parameters:
+        for p in _list_moved(parameters):
             assert p.grad is not None
             mean = self.state[p].setdefault("momentum", torch.zeros_like(p))
             mean.lerp_(p.grad, 1 - group["momentum"])
@@ -104,6 +104,18 @@ class Muon(Optimizer):
             spread = (state["square"] / (1 - second**t)).sqrt_().add_(group["eps"])
             p.mul_(1 - group["lr"] * group["weight_decay"])
             p.addcdiv_(state["mean"], spread, value=-group["lr"] / (1 - first**t))
+
+
+def _list_moved(parameters: list[Tensor]) -> list[Tensor]:
+    """Return those of the parameters whose gradient is not zero throughout.
+
+    Orthogonalized, what is left of the momentum would be a step of full size: a loss of weight 0
+    must move nothing.
+    """
+    if not parameters:
+        return parameters
+    largest = torch.stack([p.grad.abs().amax() for p in parameters if p.grad is not None])
+    return [p for p, any_ in zip(parameters, (largest != 0).tolist(), strict=True) if any_]
 
 
 def orthogonalize(matrices: Tensor, steps: int = 5) -> Tensor:

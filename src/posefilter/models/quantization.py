@@ -18,6 +18,8 @@ from posefilter.types import ObjectModel
 
 _LEAST = 4096  # smaller tensors are not worth a scale
 _SUFFIX = "#scale"
+_OFFSET = "points_from"  # the point that packed points are relative to, where there is one
+_FAR = 0.25  # [m] of the object's center from its origin, where half precision is 0.1 mm
 
 
 def pack(state: Mapping[str, Tensor]) -> dict[str, Tensor]:
@@ -64,9 +66,21 @@ def unpack(packed: Mapping[str, Tensor]) -> dict[str, Tensor]:
 def pack_object(plain: Mapping[str, Any]) -> dict[str, Any]:
     """Return an object, as a checkpoint holds it, with surface points in half precision, and the
     normals and colors of its texture in 8 bits; one that was packed before is as it was.
+
+    Where the origin of the mesh is far from the object, points are relative to its center.
     """
-    out = {**plain, "points": plain["points"].half()}
-    texture = plain.get("texture")
+    if _OFFSET in plain:
+        return dict(plain)
+    texture, points = plain.get("texture"), plain["points"]
+    out = dict(plain)
+    if float(plain["center"].norm()) > _FAR:
+        out[_OFFSET] = plain["center"]
+        points = points - plain["center"].to(points)
+        if texture is not None:
+            texture = texture.float()
+            texture = torch.cat([texture[:, :3] - plain["center"].to(texture), texture[:, 3:]], 1)
+            out["texture"] = texture
+    out["points"] = points.half()
     if texture is None or plain.get("texture_look") is not None:
         return out
     look = torch.cat([(texture[:, 3:6] + 1) / 2, texture[:, 6:]], dim=1).float()
@@ -77,10 +91,15 @@ def pack_object(plain: Mapping[str, Any]) -> dict[str, Any]:
 def unpack_object(packed: Mapping[str, Any]) -> ObjectModel:
     """Return the object that a checkpoint holds, its surface points in full precision."""
     fields = {**packed, "points": packed["points"].float()}
-    look = fields.pop("texture_look", None)
+    look, offset = fields.pop("texture_look", None), fields.pop(_OFFSET, None)
     if look is not None:
         normals, colors = (look.float() / 255).chunk(2, dim=1)
         normals = F.normalize(2 * normals - 1, dim=1)
         # as precise as it was before it was packed, so that old files and new ones are alike
         fields["texture"] = torch.cat([fields["texture"].float(), normals, colors], 1).half()
+    if offset is not None:
+        fields["points"] = fields["points"] + offset.to(fields["points"])
+        if fields["texture"] is not None:
+            texture = fields["texture"].float()  # in half precision it would be rounded again
+            fields["texture"] = torch.cat([texture[:, :3] + offset.to(texture), texture[:, 3:]], 1)
     return ObjectModel(**fields)

@@ -22,6 +22,7 @@ from posefilter.geometry.lookup import gather_rows
 from posefilter.types import Batch, ObjectModel, Trace
 
 STRIDE = 8  # pixels a cell
+CENTRAL = STRIDE // 2 - 1  # [px] from its corner, the first of its four central pixels
 
 
 class Coordinates(NamedTuple):
@@ -74,8 +75,10 @@ def true_coordinates(
     Returns:
         The object point of each cell (B, h, w, 3), from the center, in radii; whether the cell's
         central pixel is on the object (B, h, w) bool; and whether its depth is valid too, bool.
+        That pixel is the first whose depth is measured (`measure_cells`): at the object's rim the
+        next one may show what lies behind it.
     """
-    on = whole_cells(mask)[:, 0, STRIDE // 2 :: STRIDE, STRIDE // 2 :: STRIDE]
+    on = whole_cells(mask)[:, 0, CENTRAL::STRIDE, CENTRAL::STRIDE]
     R, t = camera_from_object[:, None, :3, :3], camera_from_object[:, None, None, :3, 3]
     truth = ((cells.point - t) @ R - center) / radius
     return truth, on, on & cells.valid & within_bounds(truth)

@@ -5,10 +5,8 @@ from torch import Generator, Tensor
 
 from posefilter.geometry.camera import back_project, pixel_grid
 from posefilter.geometry.votes import draw_votes
-from posefilter.nets.coordinates import STRIDE, Cells, Coordinates, whole_cells
+from posefilter.nets.coordinates import CENTRAL, STRIDE, Cells, Coordinates, whole_cells
 from posefilter.types import Batch
-
-_BEFORE = STRIDE // 2 - 1  # [px] the central pixel of a cell's four that is nearest to its corner
 
 
 def measure_cells(depth: Tensor, K: Tensor) -> Cells:
@@ -28,7 +26,7 @@ def measure_cells(depth: Tensor, K: Tensor) -> Cells:
         candidate = middle[:, :, row, :, col]
         take = (z == 0) & (candidate > 0)
         z = torch.where(take, candidate, z)
-        offset = torch.tensor([col, row], dtype=depth.dtype, device=depth.device) + _BEFORE
+        offset = torch.tensor([col, row], dtype=depth.dtype, device=depth.device) + CENTRAL
         pixel = torch.where(take[..., None], corner + offset, pixel)
     point = back_project(pixel.flatten(1, 2), z.flatten(1), K).unflatten(1, (h, w))
     return Cells(point, z > 0)
@@ -43,7 +41,7 @@ def _list_central(depth: Tensor) -> Tensor:
     """Return the central pixels of whole cells.  (B, 1, H, W) -> (B, h, 2, w, 2)."""
     _, _, H, W = depth.shape
     blocks = depth[:, 0].unflatten(1, (H // STRIDE, STRIDE)).unflatten(3, (W // STRIDE, STRIDE))
-    two = slice(_BEFORE, _BEFORE + 2)
+    two = slice(CENTRAL, CENTRAL + 2)
     return blocks[:, :, two, :, two]
 
 
