@@ -479,7 +479,7 @@ def read_arguments(particles):
     if len(sys.argv) != 6:
         sys.exit(f"usage: {particles}.py FOLDER RGB DEPTH fx,fy,cx,cy DEPTH_UNITS_A_METER")
     folder, rgb, depth, intrinsics, scale = sys.argv[1:]
-    if not (Path(folder) / "filter.json").is_file():
+    if not all((Path(folder) / name).is_file() for name in ("filter.json", "encode.onnx")):
         sys.exit(f"{folder}: no folder that export.py format=onnx wrote")
     own = json.loads((Path(folder) / "filter.json").read_text())["particles_are"]
     if own != particles:
@@ -491,12 +491,15 @@ def read_arguments(particles):
         sys.exit(f"{intrinsics} {scale}: expected fx,fy,cx,cy [px] and the units in a meter")
     if not units > 0:
         sys.exit(f"{scale}: expected the depth image's units in a meter, above 0")
-    color, z = cv2.imread(rgb), cv2.imread(depth, cv2.IMREAD_UNCHANGED)
+    color = cv2.imread(rgb, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+    z = cv2.imread(depth, cv2.IMREAD_UNCHANGED)
     for name, image in ((rgb, color), (depth, z)):
         if image is None:
             sys.exit(f"{name}: no image that OpenCV reads")
     if z.ndim != 2:
         sys.exit(f"{depth}: has {z.shape[2]} channels, and depth has one")
+    if z.dtype == np.uint16:
+        z[z == 65535] = 0  # saturated, and no measurement
     if not z.any():
         sys.exit(f"{depth}: no pixel has depth")
     color, z = cv2.cvtColor(color, cv2.COLOR_BGR2RGB), z / units

@@ -75,12 +75,15 @@ def test_an_evaluation_of_an_unfinished_run_is_not_its_result(tmp_path: Path) ->
 def test_an_evaluation_stays_where_its_run_goes_on(tmp_path: Path) -> None:
     run = fill(tmp_path / "run", iou=0.5)
     (run / "errors.csv").write_text("of the run")
+    (run / "figures").mkdir()
+    (run / "figures" / "test_worst.jpg").write_text("a picture of the run")
     assert move_evaluation(run) is None
     before = contents(run)
     for number in (1, 2):
         keep_training_results(run)
         found = {"metrics.json": json.dumps({"command": "evaluate", "iou": number})}
-        found |= dict.fromkeys(("errors.csv", "poses.csv"), f"of evaluation {number}")
+        names = ("errors.csv", "poses.csv", "figures/test_worst.jpg")
+        found |= dict.fromkeys(names, f"of evaluation {number}")
         for name, text in found.items():
             (run / name).write_text(text)
         place = run / f"evaluation_{number}"

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from posefilter.report.charts import LIGHT, Line, Panel, draw_chart
+from posefilter.report.blocks import name_chart
+from posefilter.report.charts import LIGHT, Line, Panel, distinguish, draw_chart
 
 
 @pytest.mark.parametrize("label", ["run {}", "model=patch_pf variant=working seed={}"])
@@ -29,3 +30,30 @@ def test_a_legend_of_long_names_stays_within_the_chart(
     assert not written[:, :2].any()
     assert not written[:, -2:].any()
     assert not written[-2:].any()
+
+
+def test_long_names_keep_what_tells_them_apart() -> None:
+    runs = [f"outputs/runs/2026-01-0{n}_10-00/checkpoints/best.ckpt" for n in (1, 2)]
+    assert distinguish(runs) == ["…2026-01-01_10-00…", "…2026-01-02_10-00…"]
+    settings = [f"model.net.width={n} filter.particles=100" for n in (16, 32)]
+    assert distinguish(settings) == ["…width=16…", "…width=32…"]
+    assert distinguish(["short", "other"]) == ["short", "other"]
+    assert distinguish(["one long name of a single line"]) == ["one long name of a si…"]
+
+
+@pytest.mark.parametrize("label", ["_old", "a$^$b", "$x$"])
+def test_odd_names_are_written_as_they_are(label: str) -> None:
+    lines = [Line(one, [0.0, 1.0], [1.0, 2.0]) for one in (label, "other")]
+    odd, plain = (
+        draw_chart(Panel("ADD AUC", "time [s]", "", some), LIGHT)
+        for some in (lines, [Line("other", [0.0, 1.0], [1.0, 2.0])] * 2)
+    )
+    assert odd != plain
+
+
+def test_a_charts_file_has_a_name_that_file_systems_take() -> None:
+    long = [Panel(f"ADD of {'é' * 120}{n}", f"ADD of {'a' * 119} [mm]", "", []) for n in (1, 2)]
+    names = [name_chart(panel) for panel in long]
+    assert names[0] != names[1]
+    assert max(len(name.encode()) for name in names) < 200
+    assert name_chart(Panel("ADD AUC", "steps", "%", [])) == "add-auc-steps"

@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -14,7 +15,7 @@ from posefilter.report.diagnostics import (
     diagnose,
     format_duration,
 )
-from posefilter.report.events import Curve, drop_repeats, rename_losses
+from posefilter.report.events import Curve, drop_repeats, list_starts, rename_losses
 from posefilter.report.gather import read_run
 from posefilter.report.images import group_by_section, sort_by_number
 from posefilter.report.settings import Change, compare_settings
@@ -172,3 +173,39 @@ def test_credible_sets_that_are_too_small_are_a_sign_of_failure(run: Path) -> No
         found = {one.diagnostic.key: one.bad for one in diagnose(read_run(run))}
         assert found["credibility/coverage_90"] == bad
         assert not found["belief/distance_coverage_90"]
+
+
+def test_a_pause_before_a_run_went_on_is_no_training_time(run: Path) -> None:
+    record = read_run(run)
+    curve = record.curves["train/loss"]
+    before, gap = len(curve.times) // 2, 3 * 24 * 3600.0
+    times = tuple(t + gap * (n >= before) for n, t in enumerate(curve.times))
+    late = replace(record, curves={**record.curves, "train/loss": curve._replace(times=times)})
+    assert dict(collect_timings(late))["training, validations included"].startswith("72 h")
+    # its second event file was begun half a second before the next entry, 5 s after the last
+    known = replace(late, starts=[curve.times[0] - 1, times[before] - 0.5])
+    assert dict(collect_timings(known))["training, validations included"] == "40 s"
+
+
+def test_event_files_say_when_they_were_begun(tmp_path: Path) -> None:
+    for name in ("1700000500.pc.1.0", "1700000000.my.host.2.0", "odd"):
+        (tmp_path / f"events.out.tfevents.{name}").touch()
+    assert list_starts(tmp_path) == [1700000000.0, 1700000500.0]
+
+
+def test_a_symmetric_object_is_not_judged_by_a_distance_that_knows_no_symmetry(run: Path) -> None:
+    file = run / "metrics.json"
+    metrics = json.loads(file.read_text())
+    metrics["belief"]["distance_coverage_90"] = 1.5
+    for auc, judged in ((metrics["add"]["auc"], True), (99.0, False)):
+        metrics["add_up_to_symmetry"] = {"auc": auc}
+        file.write_text(json.dumps(metrics))
+        keys = {one.diagnostic.key for one in diagnose(read_run(run))}
+        assert ("belief/distance_coverage_90" in keys) == judged
+
+
+def test_tracks_are_no_run(tmp_path: Path) -> None:
+    for name in ("metrics.json", "tracks.csv"):
+        (tmp_path / name).write_text("{}")
+    with pytest.raises(UserError, match=r"holds tracks of track\.py"):
+        read_run(tmp_path)

@@ -13,7 +13,7 @@ import pytest
 
 from posefilter.errors import UserError
 from posefilter.metrics.image_errors import FILE, ImageError, write_errors
-from posefilter.report.blocks import Text
+from posefilter.report.blocks import Paragraph, Section, Text
 from posefilter.report.comparison_page import (
     judge,
     list_settings,
@@ -29,8 +29,10 @@ from posefilter.report.image_errors import (
     compute_cdf,
     group_by_visibility,
     is_found,
+    list_worst,
     measure_auc,
 )
+from posefilter.report.page import Page
 from posefilter.report.run_page import make_run_page
 
 
@@ -245,3 +247,13 @@ def test_of_two_evaluations_what_was_typed_is_compared(pair: tuple[Path, Path]) 
     ]
     assert "what was typed" in str(note)
     assert a.missing[0].startswith("An evaluation")
+
+
+def test_the_worst_of_a_symmetric_object_are_those_that_are_wrong_up_to_symmetry() -> None:
+    rows = [make_row(i, 150.0)._replace(add_up_to_symmetry_mm=1.0) for i in range(3)]
+    rows.append(make_row(9, 40.0)._replace(add_up_to_symmetry_mm=40.0))
+    text = Page("x", "x", [], [], [], [Section("x", list_worst(rows))], Paragraph([])).render()
+    assert "ADD up to symmetry" in text
+    assert text.index("000009") < text.index("000000")
+    plain = list_worst([make_row(i, 5.0) for i in range(3)])
+    assert "symmetry" not in str(plain)

@@ -242,3 +242,41 @@ def test_a_run_that_was_evaluated_since_keeps_its_row(sweep: Path) -> None:
     assert (after.axes, after.jobs) == (before.axes, before.jobs)
     with pytest.raises(UserError, match="is a run's folder; give it as run="):
         read_sweep(own)
+
+
+def test_lines_go_through_their_numbers_by_size(tmp_path: Path) -> None:
+    """Also where the first job of a sweep has no result."""
+    rows = [
+        f"{loss},{n},{n / 10}"
+        for loss, n in product("ab", (50, 100, 400))
+        if (loss, n) != ("a", 50)
+    ]
+    text = "\n".join(["loss,filter.particles,add_auc", *rows])
+    (tmp_path / "summary.csv").write_text(text + "\n")
+    found = read_sweep(tmp_path)
+    (panel,) = chart_over("filter.particles", found, group_jobs(found), [find_metric("add/auc")])
+    assert [list(line.x) for line in panel.lines] == [[100.0, 400.0], [50.0, 100.0, 400.0]]
+
+
+def test_a_sweep_over_seeds_is_not_asked_for_seeds(tmp_path: Path) -> None:
+    (tmp_path / "summary.csv").write_text("seed,add_auc\n0,80\n1,82\n2,81\n")
+    assert "One seed each" not in make_sweep_page(read_sweep(tmp_path), None, None, "x").render()
+    (tmp_path / "summary.csv").write_text("filter.particles,add_auc\n50,80\n100,82\n")
+    assert "One seed each" in make_sweep_page(read_sweep(tmp_path), None, None, "x").render()
+
+
+def test_tiles_are_of_the_test_that_the_table_shows(tmp_path: Path, run: Path) -> None:
+    """Also where an evaluation has written its own numbers since."""
+    own = tmp_path / "sweep" / "filter.particles=50"
+    shutil.copytree(run, own)
+    typed = {"overrides": ["filter.particles=50"]}
+    for name, auc in (("metrics_train.json", 95.0), ("metrics.json", 10.0)):
+        (own / name).write_text(json.dumps({"add": {"auc": auc}, **typed}))
+    other = tmp_path / "sweep" / "filter.particles=100"
+    other.mkdir()
+    (other / "metrics.json").write_text(
+        json.dumps({"add": {"auc": 50.0}, "overrides": ["filter.particles=100"]})
+    )
+    found = read_sweep(tmp_path / "sweep")
+    page = make_sweep_page(found, read_run(own), None, "x")
+    assert [tile.value for tile in page.tiles if tile.label == "ADD AUC"] == ["95.0"]

@@ -48,7 +48,9 @@ class ErrorTable(TraceCallback):
         self.rows += rows
         for i, row in enumerate(rows):
             error = (
-                row.add_mm / 1000 if math.isfinite(row.diameter_mm) else 1 - row.particles_on_object
+                row.error_mm / 1000
+                if math.isfinite(row.diameter_mm)
+                else 1 - row.particles_on_object
             )
             keep = partial(keep_image, trace, batch, method, i, error, row.image)
             self._selection.offer(error, keep)

@@ -24,7 +24,7 @@ from posefilter.figures.overlay import Shape, draw_poses, list_axes, view_poses
 from posefilter.figures.particles import draw_particles, draw_weight_scale
 from posefilter.meshes.store import MeshStore
 from posefilter.metrics.beliefs import on_object
-from posefilter.metrics.errors import add
+from posefilter.metrics.errors import add_up_to_symmetry
 from posefilter.models.base import PoseEstimator
 from posefilter.types import Batch, BeliefBatch, ParticleOutput, Particles, Trace
 
@@ -37,7 +37,7 @@ class KeptImage(NamedTuple):
 
     frame_id: int
     name: str  # of the frame
-    # ADD [m]; for methods that tell no pose, the share of the particles that miss the object
+    # ADD up to symmetry [m]; for methods that tell no pose, the share of particles that miss
     error: float
     rgb: np.ndarray  # (H, W, 3) uint8
     intrinsics: np.ndarray  # (3, 3) [px]
@@ -48,11 +48,12 @@ class KeptImage(NamedTuple):
 
 
 def compute_errors(trace: Trace, batch: Batch, method: PoseEstimator, points: Tensor) -> Tensor:
-    """Return how wrong each image is, infinite where no number says: ADD [m], or the share of
-    particles that miss.  (B,).
+    """Return how wrong each image is, infinite where no number says: ADD up to symmetry [m], or the
+    share of particles that miss.  (B,).
     """
     if "pose" in method.capabilities:
-        error = add(trace.belief.best.detach(), batch.camera_from_object, points)
+        best, truth = trace.belief.best.detach(), batch.camera_from_object
+        error = add_up_to_symmetry(best, truth, points, method.object_model.symmetries.to(best))
     else:
         error = 1 - on_object(batch.mask, method.particle_pixels(trace.particles[-1], batch))
     return torch.nan_to_num(error.double(), nan=torch.inf)

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from rich.console import Console
 from rich.table import Table
+from rich.text import Text
 
 from posefilter.checking.compare import Fit, View, compare, half_pixel, likely_causes
 from posefilter.checking.contact_figure import tile, write_sheet
@@ -102,7 +103,7 @@ def format_report(report: dict[str, Any]) -> str:
             _text(row["visible_share"], 2),
             str(row["empty_masks"]),
         )
-        table.add_row(row["object"], str(row["frames"]), *numbers)
+        table.add_row(Text(row["object"]), str(row["frames"]), *numbers)
     console = Console(width=110, record=True, file=io.StringIO(), color_system=None)
     console.print(table)
     lines = [f"  - {problem}" for problem in report["problems"]]

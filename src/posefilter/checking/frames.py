@@ -51,7 +51,9 @@ def describe_suspects(suspects: Sequence[Suspect], geometry: Geometry) -> list[s
             out.append(f"{words}{one.flaw}")
             continue
         causes = _find_causes(one, geometry) if k < _MOST_TRIED else []
-        numbers = f"silhouette IoU {one.fit.iou:.2f}, depth {one.fit.depth_error_mm:.0f} mm off"
+        numbers = f"silhouette IoU {one.fit.iou:.2f}"
+        if not math.isnan(one.fit.depth_error_mm):  # mask and mesh overlap
+            numbers += f", depth {one.fit.depth_error_mm:.0f} mm off"
         out.append(words + ("; ".join(causes) or f"{numbers}: pose, label or depth of another?"))
     return out
 

@@ -65,11 +65,11 @@ def show_table(console: str, title: str, rows: Sequence[tuple[str, str]]) -> Non
     if is_follower() or console == JSON:
         return
     # a title is cut where the table is narrower
-    table = Table("", "", title=title, show_header=False, min_width=len(title))
+    table = Table("", "", title=Text(title), show_header=False, min_width=len(title))
     table.title_justify, table.title_style = "left", "bold"
     table.columns[1].justify = "right"
     for row in rows:
-        table.add_row(*row)
+        table.add_row(*(Text(cell) for cell in row))
     Console().print(table)
 
 

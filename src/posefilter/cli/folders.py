@@ -125,8 +125,14 @@ def deciding(overrides: list[str]) -> list[str]:
 
 # what an evaluation writes, the file by which it is known last; and where what a run's own test has
 # found is then
-_EVALUATION = ("errors.csv", "poses.csv", "beliefs.npz", "metrics.json")
-_OWN_RESULTS = {"metrics_train.json": "metrics.json", "errors_train.csv": "errors.csv"}
+_PICTURES = ("figures/test_worst.jpg", "figures/test_best.jpg")
+_EVALUATION = ("errors.csv", "poses.csv", "beliefs.npz", *_PICTURES, "metrics.json")
+_OWN_RESULTS = {
+    "metrics_train.json": "metrics.json",
+    "errors_train.csv": "errors.csv",
+    "figures/train_test_worst.jpg": _PICTURES[0],
+    "figures/train_test_best.jpg": _PICTURES[1],
+}
 
 
 def move_evaluation(folder: Path) -> Path | None:
@@ -143,6 +149,7 @@ def move_evaluation(folder: Path) -> Path | None:
     place.mkdir()
     for name in _EVALUATION:
         if (folder / name).is_file():
+            (place / name).parent.mkdir(exist_ok=True)
             (folder / name).replace(place / name)
     for own, name in _OWN_RESULTS.items():
         if (folder / own).is_file():
@@ -152,7 +159,7 @@ def move_evaluation(folder: Path) -> Path | None:
 
 def keep_training_results(folder: Path) -> None:
     """Set what a run's own test has written aside, before an evaluation in its folder writes
-    others: `metrics_train.json`, `errors_train.csv`.
+    others: `metrics_train.json`, `errors_train.csv`, and its pictures.
     """
     if not (folder / "metrics.json").is_file() or holds_evaluation(folder):
         return

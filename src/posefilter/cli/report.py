@@ -10,7 +10,7 @@ from hydra.types import RunMode
 from omegaconf.errors import OmegaConfBaseException
 
 from posefilter.cli.arguments import TYPED
-from posefilter.cli.console import ended
+from posefilter.cli.console import ended, typed
 from posefilter.cli.job import Job
 from posefilter.cli.plain import to_plain
 from posefilter.cli.renamed import update, upgrade
@@ -38,7 +38,7 @@ def report(job: Job) -> None:
             "two runs' folders"
         )
     ((kind, value),) = given.items()
-    folder, command = Path(str(value)), f"python report.py {kind}={value}"
+    folder, command = Path(str(value)), typed("report", **{kind: value})
     if kind != "runs":
         check_links(folder)
     if kind == "run":

@@ -4,6 +4,7 @@ iteration to the next; and its encoding as a GIF.
 
 from collections.abc import Iterator, Sequence
 from io import BytesIO
+from itertools import islice, repeat
 from typing import Any
 
 import numpy as np
@@ -133,9 +134,19 @@ class Animation:
         return np.concatenate([self.head, middle, self.foot])
 
 
-def encode_gif(frames: Sequence[np.ndarray], milliseconds: int = 220, hold: int = 1500) -> bytes:
+def encode_gif(
+    frames: Sequence[np.ndarray],
+    milliseconds: int | Sequence[int] = 220,
+    hold: int = 1500,
+) -> bytes:
     """Return frames as an animated GIF that loops, the one animation that TensorBoard plays; the
     last is held.
+
+    Args:
+        frames: (H, W, 3) uint8 each.
+        milliseconds: How long each is shown, in whole hundredths of a second; or the time of each
+            but the last.
+        hold: The same of the last.
     """
     free = _COLORS - len(_KEPT)
     # as good for choosing colors, and nine times sooner
@@ -152,7 +163,8 @@ def encode_gif(frames: Sequence[np.ndarray], milliseconds: int = 220, hold: int 
         kept = frame if before is None else np.where(frame == before, np.uint8(_COLORS), frame)
         images.append(Image.fromarray(kept, "P"))
         images[-1].putpalette(palette.tobytes())
-    durations = [milliseconds] * (len(frames) - 1) + [hold]
+    waits = milliseconds if isinstance(milliseconds, Sequence) else repeat(milliseconds)
+    durations = [*islice(waits, len(frames) - 1), hold]
     stream = BytesIO()
     save: dict[str, Any] = {"loop": 0, "transparency": _COLORS, "disposal": 1, "optimize": False}
     images[0].save(

@@ -88,8 +88,10 @@ def draw_curve_panel(
     """
     plot = _draw_rules(x, y, width, height)
     for values, color in lines:
-        path = np.stack([places, np.clip(values, y.low, y.high)], 1)
-        draw_lines(plot, [_locate(path, x, y, plot)], color, thick, halo=False)
+        path = _locate(np.stack([places, np.clip(values, y.low, y.high)], 1), x, y, plot)
+        if len(path) == 1:  # a line of one point would not be seen
+            path = path + np.array([[-thick, 0.0], [thick, 0.0]])
+        draw_lines(plot, [path], color, thick, halo=False)
     return add_frame(plot, x, y)
 
 

@@ -84,8 +84,9 @@ class VideoWriter:
                     self._check_part()
                     self._part.replace(self.path)
             if self._pictures and keep:
-                wait = round(1000 / self.fps)
-                write_whole(self.path, encode_gif(self._pictures, wait, hold=wait))
+                shown, waits = pace_gif(len(self._pictures), self.fps)
+                pictures = [self._pictures[n] for n in shown]
+                write_whole(self.path, encode_gif(pictures, waits[:-1], hold=waits[-1]))
         finally:
             self._part.unlink(missing_ok=True)
             logging.setLogLevel(self._level)
@@ -100,3 +101,19 @@ class VideoWriter:
                 f"{self.path}: cannot be written ({frames} of {self._count} frames are on the "
                 f"disk; is it full?)"
             )
+
+
+def pace_gif(count: int, fps: float) -> tuple[list[int], list[int]]:
+    """Return which pictures of a video a GIF shows, and how long each [ms], so that it plays at the
+    video's speed.
+
+    A GIF counts in hundredths of a second, and browsers show what is to take less than two for ten.
+    """
+    ends = [round(100 * (n + 1) / fps) for n in range(count)]
+    shown, waits, since = list[int](), list[int](), 0
+    for n, end in enumerate(ends):
+        if end - since >= 2 or not shown:
+            shown.append(n)
+            waits.append(10 * max(2, end - since))
+            since = max(end, since + 2)
+    return shown, waits

@@ -37,6 +37,14 @@ class ImageError(NamedTuple):
     credible_rank: float = math.nan  # share of the belief that is denser than the truth
     add_up_to_symmetry_mm: float = math.nan
 
+    @property
+    def error_mm(self) -> float:
+        """The ADD up to symmetry; the ADD where it is not known, as in files of earlier
+        versions.
+        """
+        known = not math.isnan(self.add_up_to_symmetry_mm)
+        return self.add_up_to_symmetry_mm if known else self.add_mm
+
 
 def write_errors(path: Path, rows: Sequence[ImageError]) -> None:
     """Write errors.csv with all digits, so that metrics.json can be recomputed from it exactly."""

@@ -3,12 +3,15 @@
 Nothing here is HTML, so nothing here needs escaping.
 """
 
+import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import ClassVar, Literal, NamedTuple
 
 from posefilter.report.charts import DARK, LIGHT, WIDTH_PX, Panel, draw_chart, measure_height
 from posefilter.report.images import WIDE_PX, StoredImage, encode_image, encode_png
+
+_LONGEST = 160  # [bytes] of a chart's file name, less its suffix
 
 Style = Literal["", "code", "soft", "good", "bad", "done", "badge"]
 
@@ -129,7 +132,7 @@ def draw_charts(panels: Sequence[Panel]) -> list[Charts]:
     charts = []
     for panel in panels:
         light, dark = draw_chart(panel, LIGHT), draw_chart(panel, DARK)
-        file = f"{make_slug(panel.title)}-{make_slug(panel.xlabel)}.png"
+        file = f"{name_chart(panel)}.png"
         height, words = measure_height(panel), describe_panel(panel)
         charts.append(
             Chart(encode_png(light), encode_png(dark), WIDTH_PX, height, words, file, light)
@@ -153,6 +156,14 @@ def describe_panel(panel: Panel) -> str:
     """Return a chart in words."""
     ends = "; ".join(f"{line.label} {line.y[-1]:.4g}" for line in panel.lines if len(line.y))
     return f"{panel.title} over {panel.xlabel}, at the end: {ends}"
+
+
+def name_chart(panel: Panel) -> str:
+    """Return a name for a chart's file, of a length that every file system takes."""
+    slug = f"{make_slug(panel.title)}-{make_slug(panel.xlabel)}"
+    if len(slug.encode()) <= _LONGEST:
+        return slug
+    return f"{slug[: _LONGEST // 4]}-{hashlib.sha256(slug.encode()).hexdigest()[:12]}"
 
 
 def make_slug(name: str) -> str:

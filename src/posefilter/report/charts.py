@@ -2,8 +2,9 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from io import BytesIO
+from itertools import takewhile
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -16,6 +17,8 @@ from posefilter.figures.canvas import create_figure, rasterize
 
 WIDTH_PX, HEIGHT_PX, FINER = 380, 250, 2  # as shown; drawn at twice that for sharp screens
 MOST_TICKS = 10  # swept values that are marked on an axis
+_ENDS = "/. ,"  # of the words of a name
+LONGEST_LABEL = 52  # of a legend, in characters
 NOISY = 60  # points, from which on a line is drawn smoothed over its own faint self
 
 
@@ -90,7 +93,9 @@ def draw_chart(panel: Panel, theme: Theme) -> bytes:
 
 def draw_panel(axes: Axes, panel: Panel, theme: Theme) -> None:
     """Draw a chart into axes, but for its legend."""
-    for number, line in enumerate(panel.lines):
+    labels = distinguish([line.label for line in panel.lines], LONGEST_LABEL)
+    for number, (line, label) in enumerate(zip(panel.lines, labels, strict=True)):
+        line = replace(line, label=escape(label))
         color = theme.lines[number % len(theme.lines)]
         if panel.categories:
             draw_across(axes, line, color)
@@ -161,7 +166,8 @@ def style_axes(axes: Axes, panel: Panel, theme: Theme) -> None:
     axes.spines[["top", "right"]].set_visible(False)
     axes.spines[["left", "bottom"]].set_color(theme.soft)
     if panel.categories:
-        axes.set_yticks(range(len(panel.categories)), [shorten(name) for name in panel.categories])
+        names = [escape(name) for name in distinguish(panel.categories)]
+        axes.set_yticks(range(len(names)), names)
         axes.set_ylim(len(panel.categories) - 0.5, -0.5)
         if panel.limits:
             axes.set_xlim(*panel.limits)
@@ -202,6 +208,36 @@ def smooth(values: Sequence[float]) -> np.ndarray:
     low, high = at - back, at + np.minimum(back, len(y) - 1 - at) + 1
     n = count[high] - count[low]
     return np.where(n > 0, (total[high] - total[low]) / np.maximum(n, 1), math.nan)
+
+
+def distinguish(names: Sequence[str], max_length: int = 22) -> list[str]:
+    """Return names short enough for a chart, without what long ones have in common."""
+    if all(len(name) <= max_length for name in names):
+        return list(names)
+    if len(set(names)) > 1:
+        first = _count_common(names)
+        last = _count_common([name[first:][::-1] for name in names])
+        # whole words: what is left out ends where one does
+        first = max((names[0].rfind(end, 0, first) + 1 for end in _ENDS), default=0)
+        tail = names[0][len(names[0]) - last :]
+        last -= min((at for end in _ENDS if (at := tail.find(end)) >= 0), default=last)
+        start, end = "…" if first else "", "…" if last else ""
+        names = [start + name[first : len(name) - last] + end for name in names]
+    return [shorten(name, max_length) for name in names]
+
+
+def _count_common(names: Sequence[str]) -> int:
+    """Return by how many characters all names begin alike."""
+    columns = zip(*names, strict=False)
+    return sum(1 for _ in takewhile(lambda column: len(set(column)) == 1, columns))
+
+
+def escape(text: str) -> str:
+    """Return a text that Matplotlib writes as it is: a dollar sign begins no formula, and a line
+    down at the start hides no entry of a legend.
+    """
+    text = text.replace("$", r"\$")
+    return f" {text}" if text.startswith("_") else text
 
 
 def shorten(text: str, max_length: int = 22) -> str:

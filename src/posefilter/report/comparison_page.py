@@ -25,14 +25,13 @@ from posefilter.report.blocks import (
 )
 from posefilter.report.charts import Line, Panel
 from posefilter.report.gather import Run, read_run
-from posefilter.report.image_errors import chart_errors
+from posefilter.report.image_errors import EQUAL_MM, chart_errors
 from posefilter.report.page import Page
 from posefilter.report.result_tables import compare_numbers
 from posefilter.report.run_page import list_changes
 from posefilter.report.settings import compare_settings, read_typed
 
 LISTED = 10  # images in a table of the greatest changes
-EQUAL_MM = 0.05  # errors that differ by less are written alike
 
 
 class Pair(NamedTuple):

@@ -60,6 +60,9 @@ DIAGNOSTICS = (
 def diagnose(run: Run) -> list[Finding]:
     """Return the diagnostics that a run has numbers for, the bad ones first."""
     known = collect_numbers(run)
+    plain, best = (known.get(f"{name}/auc", 0.0) for name in ("add", "add_up_to_symmetry"))
+    if best > plain:  # it knows no symmetries, and a pose that is right up to one is far away by it
+        known.pop("belief/distance_coverage_90", None)
     own = [(one, known[one.key]) for one in DIAGNOSTICS if one.key in known]
     found = [Finding(one, value, one.is_bad(value)) for one, value in own]
     return sorted(found, key=lambda finding: not finding.bad)
@@ -107,8 +110,11 @@ def collect_timings(run: Run) -> list[tuple[str, str]]:
         pace = [(b - a) / (t - s) for (a, s), (b, t) in logged if t > s and b > a]
         if pace:
             out.append(("training steps a second (median)", f"{median_high(pace):.2f}"))
-        spent = format_duration(train.times[-1] - train.times[0])
-        out.append(("training, validations included", spent))
+        # a run that went on later did not train in between
+        gaps = [
+            b - max(a, *(s for s in run.starts if a < s <= b), a) for a, b in pairwise(train.times)
+        ]
+        out.append(("training, validations included", format_duration(sum(gaps))))
     if seconds := collect_numbers(run).get("seconds_per_image"):
         out.append(("filter, an image", f"{seconds:.3f} s"))
     return out

@@ -1,6 +1,7 @@
 """Read TensorBoard's event files: scalars as curves, and the latest picture of each tag."""
 
 import logging
+import re
 from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
@@ -107,6 +108,12 @@ def drop_repeats(events: list[tuple[int, float, float]]) -> Curve:
 def find_event_files(folder: Path) -> Iterator[Path]:
     """Return what TensorBoard takes for event files of a run."""
     return folder.glob("*tfevents*")
+
+
+def list_starts(folder: Path) -> list[float]:
+    """Return when each event file was begun [s], as its name has it."""
+    found = (re.search(r"tfevents\.(\d{9,12})\b", path.name) for path in find_event_files(folder))
+    return sorted(float(one[1]) for one in found if one)
 
 
 def select_unsaved(pictures: list[StoredImage], files: list[StoredImage]) -> list[StoredImage]:

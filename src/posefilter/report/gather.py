@@ -10,7 +10,13 @@ from posefilter import limits
 from posefilter.errors import UserError
 from posefilter.forms import NUMBER, TEXT, Each, Record, check_form, parse_json
 from posefilter.metrics.image_errors import FILE, ImageError
-from posefilter.report.events import Curve, find_event_files, read_events, select_unsaved
+from posefilter.report.events import (
+    Curve,
+    find_event_files,
+    list_starts,
+    read_events,
+    select_unsaved,
+)
 from posefilter.report.image_errors import read_image_errors
 from posefilter.report.images import StoredImage, read_images
 
@@ -52,6 +58,7 @@ class Run:
     pictures: list[StoredImage]
     errors: list[ImageError]  # of each image of its test
     missing: list[str] = field(default_factory=list)  # a sentence each
+    starts: list[float] = field(default_factory=list)  # of its event files [s]
 
     def named(self, key: str) -> str:
         """Return the run's model, loss or variant; "?" where nothing tells it."""
@@ -93,6 +100,7 @@ def read_run(folder: Path) -> Run:
         pictures=[*files, *select_unsaved(logged, files)],
         errors=read_image_errors(folder),
         missing=list_missing(folder, bool(files or logged), evaluation),
+        starts=list_starts(folder),
     )
 
 
@@ -100,6 +108,8 @@ def check_run(folder: Path) -> None:
     """Raise UserError unless a folder is a run's."""
     if not folder.is_dir():
         raise UserError(f"run={folder}: no such folder")
+    if (folder / "tracks.csv").is_file():
+        raise UserError(f"run={folder}: holds tracks of track.py, of which there is no report")
     if any((folder / mark).is_file() for mark in MARKS) or any(find_event_files(folder)):
         return
     if any((folder / mark).is_file() for mark in SWEEP_MARKS):

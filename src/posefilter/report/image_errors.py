@@ -21,6 +21,7 @@ LIMIT_MM = 100.0  # of thresholds: the AUC's own
 FEWEST = 8  # images in a range of visibility
 MOST = 8  # ranges of visibility
 LISTED = 12  # images in a table of the worst
+EQUAL_MM = 0.05  # errors that differ by less are written alike
 
 
 def read_image_errors(folder: Path) -> list[ImageError]:
@@ -114,19 +115,22 @@ def show_errors(rows: Sequence[ImageError]) -> list[Block]:
 def list_worst(rows: Sequence[ImageError]) -> list[Block]:
     """Return the images with the greatest errors, by name."""
     posed = [row for row in rows if not math.isnan(row.add_mm)]
-    worst = sorted(posed, key=lambda row: -row.add_mm)[:LISTED]
+    worst = sorted(posed, key=lambda row: -row.error_mm)[:LISTED]
+    symmetric = any(row.error_mm < row.add_mm - EQUAL_MM for row in posed)
     worst = worst or sorted(rows, key=lambda row: row.particles_on_object)[:LISTED]
     cells: list[list[Cell]] = [
         [
             Text(row.image, "code"),
             "–" if math.isnan(row.visibility) else f"{row.visibility:.2f}",
             "–" if math.isnan(row.add_mm) else format_length(row.add_mm / 1000),
+            *([format_length(row.error_mm / 1000)] if symmetric else []),
             "–" if math.isnan(row.add_s_mm) else format_length(row.add_s_mm / 1000),
             f"{row.particles_on_object:.0%}" if math.isfinite(row.particles_on_object) else "–",
         ]
         for row in worst
     ]
-    head = ("image", "visible share", "ADD", "ADD-S", "particles on the object")
+    kinds = ("ADD", "ADD up to symmetry", "ADD-S") if symmetric else ("ADD", "ADD-S")
+    head = ("image", "visible share", *kinds, "particles on the object")
     where = Paragraph(["Every image is in", Text(FILE, "code"), "in the run's folder."])
     table = Table(head, cells, numeric=range(1, len(head)))
     fold = Fold(f"The {len(worst)} worst of {len(rows)} images", [table])

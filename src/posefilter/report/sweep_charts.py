@@ -128,8 +128,11 @@ def draw_summary(sweep: Sweep) -> Figure | None:
     figure = create_figure(columns * WIDTH_PX, sum(heights) + _TITLE_PX)
     figure.set_layout_engine("constrained")
     count = f"{len(sweep.jobs)} run{'s' * (len(sweep.jobs) != 1)}"
-    several = "line or large dot: mean over seeds; small dots: runs"
-    notes = "one seed each: differences may be chance" if once else several
+    notes = "line or large dot: mean over seeds; small dots: runs"
+    if once:
+        notes = "differences are those of seeds"
+        if sweep.shown != ["seed"]:
+            notes = "one seed each: differences may be chance"
     title = f"Sweep over {', '.join(sweep.shown)}: {count}\n{notes}"
     figure.suptitle(title, fontsize=12, fontweight="bold")
     axes = figure.subplots(len(rows), columns, squeeze=False, height_ratios=heights)

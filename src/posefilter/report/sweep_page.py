@@ -1,6 +1,7 @@
 """Lay a sweep out on one page."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from statistics import mean, stdev
 
 from posefilter.metrics.registry import MetricInfo, find_metric
@@ -64,7 +65,9 @@ def make_sweep_page(
     title = f"Sweep {sweep.folder.resolve().name}"
     # of one run: where a setting has several, its mean is what counts
     alone = all(len(group.jobs) == 1 for group in found) or not sweep.shown
-    tiles = make_tiles(best) if best and alone else []
+    tiles = []
+    if best and alone:  # the run's own test, as in the table, also where an evaluation came after
+        tiles = make_tiles(replace(best, metrics=best.metrics_train or best.metrics))
     heading, lines = f"Sweep over {over_what}", head_lines(sweep, winner)
     return Page(title, heading, lines, tiles, list_notes(sweep, best), sections, foot)
 
@@ -141,7 +144,7 @@ def format_mean(values: Sequence[float], info: MetricInfo) -> str:
 
 def note_seeds(found: Sequence[Group]) -> list[Block]:
     """Return a caveat where every setting was run with one seed: two numbers are no trend."""
-    if any(len(group.jobs) > 1 for group in found):
+    if any(len(group.jobs) > 1 or [*group.place] == ["seed"] for group in found):
         return []
     said = "One seed each: differences may be chance. Add seed=0,1,2 to the sweep to see."
     return [Paragraph([Text(said, "soft")])]

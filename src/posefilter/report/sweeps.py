@@ -55,8 +55,9 @@ class Sweep:
         return [axis for axis in self.axes if axis != "seed"] or self.axes
 
     def values(self, axis: str) -> list[Value]:
-        """Return the values of an axis, in its order."""
-        return list(dict.fromkeys(job.place[axis] for job in self.jobs))
+        """Return the values of an axis: numbers by size, else in the order of the jobs."""
+        values = list(dict.fromkeys(job.place[axis] for job in self.jobs))
+        return values if any(isinstance(one, str) for one in values) else sorted(values)
 
 
 class Group(NamedTuple):
