@@ -156,7 +156,7 @@ RANGES: dict[str, Range] = {
         }.items()
     },
     **_each("tracker", Range(0, 100), "noise_scale", "smoothing_noise"),
-    **_each("tracker", Range(0, 1000), "icp_prior", "jump_penalty"),
+    **_each("tracker", Range(0, 1000), "icp_prior", "jump_penalty", "elsewhere_penalty"),
     **_each("tracker", SHARE, "lost_below", "found_above", "search_above"),
     **_each("tracker", COUNT, "fit_pixels", "patience", "probe_every"),
     **_each("tracker", COUNT_OR_NONE, "texture_every", "whole_image_every", "search_every"),

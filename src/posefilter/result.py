@@ -326,6 +326,8 @@ class Run(NamedTuple):
     blank: Sequence[str] = ()  # of each image, as `find_blank` says it; none: all can be judged
     # (B,) how many of the belief's first poses are draws about the estimate, None: not calibrated
     draws: torch.Tensor | None = None
+    # depth (H, W) [m] and camera matrix of a single photograph of which `batch` is a part
+    photograph: tuple[np.ndarray, np.ndarray] | None = None
 
 
 def collect_results(
@@ -357,13 +359,11 @@ def make_result(
     size = math.nan if run.size is None else float(run.size.scale[image])
     wrong_size = run.size is not None and bool(run.size.contradicts()[image])
     blank = run.blank[image] if run.blank else ""
-    warnings = find_warnings(
-        pose,
-        object_model,
+    depth, K = run.photograph or (
         run.batch.depth[image, 0].cpu().numpy(),
         run.batch.intrinsics[image].double().cpu().numpy(),
-        apparent_size=size if wrong_size else None,
     )
+    warnings = find_warnings(pose, object_model, depth, K, size if wrong_size else None)
     return Result(
         object=object_model.name,
         pose=pose,

@@ -7,7 +7,12 @@ from typing import Any
 import pytest
 import torch
 
-from posefilter.confidence.features import measure_belief, measure_coordinates, measure_depth
+from posefilter.confidence.features import (
+    measure_belief,
+    measure_coordinates,
+    measure_depth,
+    measure_hidden,
+)
 from posefilter.geometry.pose import make_pose, transform
 from posefilter.geometry.rotation import exp_so3
 from posefilter.nets.coordinates import Cells, Coordinates
@@ -79,6 +84,24 @@ def test_what_is_seen_through_speaks_against_a_pose_and_what_hides_it_says_nothi
     found = measure_depth(pose, seen, MODEL)
     assert float(found["surface"]) == 0
     assert float(found["free_space"]) == pytest.approx(free, abs=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("wall", "columns", "hidden"),
+    [(0.5, 64, 1.0), (1.6, 64, 0.0), (0.5, 32, 0.5), (1.0, 64, 0.5)],
+)
+def test_what_is_measured_before_a_pose_hides_it(wall: float, columns: int, hidden: float) -> None:
+    """`wall` [m] covers the left columns; in the others what lies behind is measured."""
+    K = torch.tensor([[100.0, 0, 31.5], [0, 100.0, 23.5], [0, 0, 1]])
+    pose = torch.eye(4)[None].clone()
+    pose[0, 2, 3] = 1.0
+    depth = torch.full((1, 1, 48, 64), 1.6)
+    depth[..., :columns] = wall
+    seen: Any = SimpleNamespace(depth=depth, intrinsics=K[None])
+    assert float(measure_hidden(pose, seen, MODEL)) == pytest.approx(hidden, abs=0.05)
+    # of unknown depth nothing can be said
+    blank: Any = SimpleNamespace(depth=torch.zeros_like(depth), intrinsics=K[None])
+    assert float(measure_hidden(pose, blank, MODEL)) == 0
 
 
 def test_particles_at_equivalent_poses_agree() -> None:

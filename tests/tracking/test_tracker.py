@@ -161,6 +161,39 @@ def test_a_loss_is_noticed_and_the_object_recovered_elsewhere() -> None:
     assert set(statuses[again + 1 :]) == {"tracked"}
 
 
+@pytest.mark.parametrize(
+    ("covered", "near", "penalty", "found"),
+    [
+        (True, False, 5.0, False),
+        (False, False, 5.0, True),
+        (True, True, 5.0, True),
+        (True, False, 0.0, True),
+    ],
+)
+def test_what_resembles_a_covered_object_elsewhere_must_show_more(
+    covered: bool, near: bool, penalty: float, found: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    toy, estimator = make_toy()
+
+    def presence(*_: object) -> tuple[float, None]:
+        return 0.0 if toy.truth is None else 0.99 if toy.truth is start else 0.9, None
+
+    monkeypatch.setattr("posefilter.tracking.track.measure_presence", presence)
+    tracker = posefilter.Tracker(estimator, TrackerSettings(elsewhere_penalty=penalty))
+    start = walk_pose(1)[0]
+    shift = torch.tensor([0.05 if near else 0.3, 0, 0, 0, 0, 0])
+    other = SPACE.move(start, shift)
+    depth = DEPTH if covered else DEPTH + 1  # before the object, or behind it
+    for toy.truth in (start, start, start, None, None, None):
+        result = tracker.update(RGB, depth, K)
+    assert result.status == "lost"
+    toy.truth = other
+    statuses = [tracker.update(RGB, depth, K).status for _ in range(6)]
+    assert ("recovered" in statuses) == found
+    # in a second or two it may have been moved
+    assert found or "recovered" in [tracker.update(RGB, depth, K).status for _ in range(60)]
+
+
 def test_a_loss_is_noticed_where_the_network_takes_other_pixels_for_the_object() -> None:
     """The calibrated presence tells what the objectness of the pixels does not."""
     toy, estimator = make_toy()
@@ -496,6 +529,7 @@ def test_several_objects_give_a_list_and_the_seed_decides() -> None:
         ({"lost_below": 0.9}, "found_above=0.5 must lie in"),
         ({"window_scale": 0.5}, "window_scale 1 or more"),
         ({"kld_quantile": 1.0}, "kld_quantile between 0 and 1"),
+        ({"elsewhere_penalty": -1.0}, "elsewhere_penalty and icp_prior must be 0 or more"),
         ({"jump_penalty": math.nan}, "jump_penalty=nan must be a finite number"),
         ({"lost_below": "0.2"}, "lost_below=0.2 must be a finite number"),
         ({"follow": None}, "follow=None must be of FilterSettings"),
@@ -626,3 +660,21 @@ def test_after_a_loss_the_print_decides_among_all_turns() -> None:
             assert off(result, pose @ PlantedRotations.TURN) < 0.01
     assert len(recovered) == 1
     assert texture.nearby == 0
+
+
+def test_warnings_are_of_the_photograph_whatever_is_looked_at() -> None:
+    """A window has another principal point, and other depth."""
+    toy, estimator = make_toy()
+    tracker = posefilter.Tracker(estimator, TrackerSettings(whole_image_every=3, window_side=64))
+    aside, middle = K.copy(), K.copy()
+    aside[0, 2] = 30.0
+    pose = walk_pose(1)[0]
+    for matrix, told in ((middle, False), (aside, True)):
+        tracker.reset()
+        toy.truth = pose
+        toy.encoded.clear()
+        for _ in range(7):
+            warnings = tracker.update(RGB, DEPTH, matrix).warnings
+            assert any("principal point is far" in one for one in warnings) == told
+            assert len(warnings) == told
+        assert {(120, 160)} < set(toy.encoded)  # some saw a window

@@ -73,16 +73,37 @@ def measure_depth(best: Tensor, batch: Batch, object_model: ObjectModel) -> dict
         (B,) each. `surface`: the share of the points that agree. `free_space`: of those that agree
         or are seen through, the share that agrees.
     """
-    points = transform(best, subsample(object_model.points, _POINTS).to(best))
+    known, behind, tolerance = _compare_depth(best, batch, object_model)
+    agrees = (known & (behind.abs() < tolerance)).float().mean(1)
+    through = (known & (behind >= tolerance)).float().mean(1)
+    few = 1 / known.shape[1]
+    return {"surface": agrees, "free_space": (agrees + few) / (agrees + through + 2 * few)}
+
+
+def measure_hidden(pose: Tensor, batch: Batch, object_model: ObjectModel) -> Tensor:
+    """Return the share of an object's surface before which something nearer is measured.
+
+    Of a visible object it is the part that faces away, of one that is covered 1. It is the share of
+    the points in the frame with known depth; where these are less than half, of half.
+
+    (B, 4, 4) camera_from_object [m] -> (B,).
+    """
+    known, behind, tolerance = _compare_depth(pose, batch, object_model)
+    hidden = (known & (behind <= -tolerance)).sum(1)
+    return hidden / known.sum(1).clamp_min(known.shape[1] / 2)
+
+
+def _compare_depth(
+    poses: Tensor, batch: Batch, object_model: ObjectModel
+) -> tuple[Tensor, Tensor, float]:
+    """Return of surface points (B, P) whether the depth at them is known, how far what is measured
+    lies behind them [m], and by how much it may for the same surface [m].
+    """
+    points = transform(poses, subsample(object_model.points, _POINTS).to(poses))
     pixels = nearest_pixel(project(points, batch.intrinsics))
     depth = gather_pixels(batch.depth, pixels)[..., 0]  # 0 off the frame
     known = (depth > 0) & (points[..., 2] > _NEAREST)
-    behind = depth - points[..., 2]  # what is measured lies so far behind the point
-    tolerance = _NOISE + 0.05 * object_model.diameter
-    agrees = (known & (behind.abs() < tolerance)).float().mean(1)
-    through = (known & (behind >= tolerance)).float().mean(1)
-    few = 1 / points.shape[1]
-    return {"surface": agrees, "free_space": (agrees + few) / (agrees + through + 2 * few)}
+    return known, depth - points[..., 2], _NOISE + 0.05 * object_model.diameter
 
 
 class _Image(NamedTuple):

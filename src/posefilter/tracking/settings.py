@@ -102,6 +102,8 @@ class TrackerSettings:
         lost_below: A frame counts against the object where its presence is below, in [0, 1].
         found_above: What a search finds is taken up where its presence is above. While a track's is
             not, the network sees the whole image in the next frame.
+        elsewhere_penalty: Log odds against an object elsewhere than where it was lost, if something
+            nearer covered it there [nat]; they fade with time.
         patience: Frames in a row that count against an object that is lost.
         search_above: While the object is lost, a probe whose presence is above is worth a search.
         probe_every: While it is lost and other objects are tracked, too, one frame in so many is
@@ -131,6 +133,7 @@ class TrackerSettings:
     smoothing_noise: float = 0.0004
     lost_below: float = 0.3
     found_above: float = 0.5
+    elsewhere_penalty: float = 5.0
     patience: int = 2
     search_above: float = 0.1
     probe_every: int = 2
@@ -142,10 +145,10 @@ class TrackerSettings:
         check_whole(self, quadratic_fits=0, fit_pixels=1, patience=1, probe_every=1)
         check_whole(self, whole_image_every=0, window_side=64, search_every=0, texture_every=0)
         least = min(self.noise_scale, self.smoothing_noise, self.jump_penalty, self.icp_prior)
-        if not (least >= 0 and self.window_scale >= 1):
+        if not (min(least, self.elsewhere_penalty) >= 0 and self.window_scale >= 1):
             raise UserError(
-                "tracker: noise_scale, smoothing_noise, jump_penalty and icp_prior must be 0 or "
-                "more, window_scale 1 or more"
+                "tracker: noise_scale, smoothing_noise, jump_penalty, elsewhere_penalty and "
+                "icp_prior must be 0 or more, window_scale 1 or more"
             )
         if not 0 <= self.search_above <= 1:
             raise UserError(f"tracker: search_above={self.search_above} must lie in [0, 1]")

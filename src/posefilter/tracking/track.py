@@ -11,6 +11,7 @@ from torch import Tensor
 
 from posefilter.confidence.apparent_size import ApparentSize
 from posefilter.confidence.calibration import Assessment
+from posefilter.confidence.features import measure_hidden
 from posefilter.confidence.tolerance import PoseTolerance
 from posefilter.confidence.verdicts import Costs
 from posefilter.data.resize import network_size
@@ -22,6 +23,7 @@ from posefilter.filters.resample import Multinomial, Systematic
 from posefilter.filters.reweight import CurrentLikelihood
 from posefilter.filters.schedule import Geometric
 from posefilter.filters.texture import TextureRotations
+from posefilter.geometry.pose import origin_of
 from posefilter.geometry.pose_statistics import twist_between
 from posefilter.geometry.spaces import PoseSpace
 from posefilter.images import Images
@@ -44,6 +46,8 @@ _MODE = 0.02  # [m] about the best particle, over which the estimate is a mean
 # by how much errors of a track are larger than those of the calibrated filter, whose estimate is
 # refined more: of five objects in rendered sequences
 _WIDENING = 1.3
+# what hides an object may hide that it is moved: half of what is known after 34 frames
+_FADES = 0.98
 _ICP_STEPS = 2  # a tracked estimate starts close: more cost a tenth of a frame's time
 
 
@@ -77,6 +81,14 @@ class TrackResult(Result):
         return "their guarantee is of one search of the whole image, not of a track"
 
 
+class Loss(NamedTuple):
+    """How an object was lost from sight."""
+
+    hidden: float  # the share of its surface before which something nearer was measured
+    speed: float  # of its center in the last frame that showed it [m]
+    frames: int = 0  # since then
+
+
 class State(NamedTuple):
     """What is carried from one frame to the next."""
 
@@ -84,6 +96,7 @@ class State(NamedTuple):
     best: Tensor  # (1, 4, 4) the estimate, smoothed over time [m]
     velocity: Tensor  # (1, 6) its motion in the last frame [m, rad]
     squared_innovation: float | None  # fading mean; see `ConstantVelocity.adapt`
+    loss: Loss | None = None  # None while it is seen
 
 
 class TrackSnapshot(NamedTuple):
@@ -203,7 +216,13 @@ class Track:
             sight = self._search(batch, predicted)
         else:
             sight = self._follow(batch, predicted, windowed=window is not None)
-        trusted, status = self.loss_detector.judge(sight.presence)
+        presence = sight.presence
+        if predicted is not None:
+            if lost and sight.belief is not None:
+                presence = self._doubt_elsewhere(presence, sight.belief, predicted)
+            if lost or presence < self.settings.lost_below:
+                predicted = self._look_behind(predicted, batch)
+        trusted, status = self.loss_detector.judge(presence)
         self.apparent_size = self.apparent_size if sight.size is None else sight.size
         if sight.found is not None and sight.found.features is not None:
             self.rotation_margin = sight.found.features.get("rotation_margin")
@@ -214,6 +233,7 @@ class Track:
         self.state = self._correct(predicted, belief, status)
         self.frames += 1
         run = self._describe(sight, frame.blank, measured=belief is not None)
+        run = run._replace(photograph=frame.shrink(self.size))
         result = make_result(run, 0, self.costs, self.pose_tolerance)
         # the guarantee of conformal sets is of the filter that was calibrated, no track's
         content = {**vars(result), "seconds": time.perf_counter() - start, "conformal": None}
@@ -287,6 +307,36 @@ class Track:
         refine = self._refine(settings.quadratic_fits, self._texture_rotations)
         found, trace = self._filter(batch, encoding, start, search, refine, with_margin=True)
         return found._replace(size=self.method.measure_apparent_size(trace, batch))
+
+    def _look_behind(self, predicted: State, batch: Batch) -> State:
+        """Return the state of an object that is not seen, with how it was lost from sight.
+
+        That is not measured again: a camera that moves sees another place where the object was
+        last.
+        """
+        if predicted.loss is not None:
+            loss = predicted.loss._replace(frames=predicted.loss.frames + 1)
+            return predicted._replace(loss=loss)
+        hidden = measure_hidden(predicted.best, batch, self.method.object_model)
+        speed = predicted.velocity[0, :3].norm()
+        return predicted._replace(loss=Loss(float(hidden), float(speed)))
+
+    def _doubt_elsewhere(self, presence: float, belief: BeliefBatch, predicted: State) -> float:
+        """Return how probable it is that a lost object is where the estimate puts it.
+
+        An object that was lost behind something is probably still there, or not farther than it
+        has moved since, and what resembles it elsewhere another.
+        """
+        loss, model = predicted.loss, self.method.object_model
+        if loss is None or not 0 < presence < 1:
+            return presence
+        found, last = (
+            origin_of(pose, model.center.to(pose)) for pose in (belief.best, predicted.best)
+        )
+        if float((found - last).norm()) < model.diameter + loss.frames * loss.speed:
+            return presence
+        against = self.settings.elsewhere_penalty * loss.hidden * _FADES**loss.frames
+        return 1 / (1 + math.exp(against) * (1 - presence) / presence)
 
     def _filter(
         self,

@@ -10,6 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from posefilter.confidence.blank import find_blank
+from posefilter.data.resize import network_size
 from posefilter.images import Images, drop_unknown, make_batch, make_sized_batch
 from posefilter.types import Batch, ObjectModel
 
@@ -52,6 +53,19 @@ class Frame:
         if size not in self._whole:
             self._whole[size] = make_batch(self.images, *size)
         return self._whole[size]
+
+    def shrink(self, size: tuple[int | None, int | None]) -> tuple[np.ndarray, np.ndarray]:
+        """Return single pixels of the depth (H', W') [m], about as many as a network sees of the
+        whole photograph, and their camera matrix (3, 3) [px].
+
+        Args:
+            size: As of `see_whole`.
+        """
+        height, width = self.images.depth.shape[1:]
+        step = max(1, round(width / network_size(height, width, *size)[1]))
+        K = self.images.intrinsics[0].astype(float)
+        K[:2] /= step
+        return self.images.depth[0, ::step, ::step], K
 
     def see_window(self, window: Window) -> Batch:
         """Return a part of the photograph."""
