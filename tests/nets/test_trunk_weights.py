@@ -55,3 +55,21 @@ def test_another_file_is_one_line(what: str, trunk: ResNet, tmp_path: Path) -> N
     with pytest.raises(UserError, match=rf"^model\.encoder\.trunk\.weights=.*{told}") as caught:
         load_trunk(trunk, str(file))
     assert "\n" not in str(caught.value)
+
+
+def test_a_trunk_of_fewer_stages_reads_a_whole_file_and_not_the_reverse(
+    trunk: ResNet, tmp_path: Path
+) -> None:
+    torch.save(changed(trunk), tmp_path / "whole.pth")
+    short = ResNet("resnet18", weights=str(tmp_path / "whole.pth"), stages=3).eval()
+    assert not any(name.startswith("layer4.") for name in short.state_dict())
+    rgb, geometry = torch.rand(1, 3, 64, 96), torch.zeros(1, 7, 32, 48)
+    with torch.no_grad():
+        for one, other in zip(short(rgb, geometry), trunk.eval()(rgb, geometry), strict=False):
+            assert torch.equal(one, other)
+    torch.save(changed(short), tmp_path / "short.pth")
+    with pytest.raises(UserError, match=r"lacks layer4\.0"):
+        load_trunk(trunk, str(tmp_path / "short.pth"))
+    for stages in (0, 5):
+        with pytest.raises(UserError, match=rf"trunk\.stages={stages}: must be 1 to 4"):
+            ResNet(stages=stages)
