@@ -3,12 +3,16 @@
 from pathlib import Path
 from typing import Any
 
+import lightning
 import pytest
 import torch
 from torch import nn
+from torch.utils.data import DataLoader
 
 from posefilter.errors import UserError
 from posefilter.nets.resnet import ResNet, load_trunk
+
+GEOMETRY = torch.ones(2, 7, 16, 16)
 
 
 @pytest.fixture(scope="module")
@@ -73,3 +77,35 @@ def test_a_trunk_of_fewer_stages_reads_a_whole_file_and_not_the_reverse(
     for stages in (0, 5):
         with pytest.raises(UserError, match=rf"trunk\.stages={stages}: must be 1 to 4"):
             ResNet(stages=stages)
+
+
+class Frozen(lightning.LightningModule):
+    """A trunk as part of a method that is trained, from images that differ from its statistics."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.trunk = ResNet(stages=1, frozen=True)
+
+    def training_step(self, rgb: torch.Tensor, number: int) -> torch.Tensor:
+        return self.trunk(rgb, GEOMETRY)[0].mean()
+
+    def validation_step(self, rgb: torch.Tensor, number: int) -> None:
+        assert not self.trunk.training
+
+    def configure_optimizers(self) -> torch.optim.Optimizer:
+        return torch.optim.SGD([p for p in self.parameters() if p.requires_grad], lr=0.1)
+
+
+def test_a_frozen_trunk_keeps_its_statistics_in_a_training() -> None:
+    """Lightning does not call `train` before the first step, and calls it after a validation."""
+    method = Frozen()
+    before = {key: value.clone() for key, value in method.trunk.state_dict().items()}
+    images = DataLoader([0.1 * torch.rand(2, 3, 32, 32) for _ in range(2)], batch_size=None)
+    trainer = lightning.Trainer(
+        max_epochs=2, logger=False, enable_checkpointing=False, accelerator="cpu",
+        enable_progress_bar=False, enable_model_summary=False, num_sanity_val_steps=0,
+    )  # fmt: skip
+    trainer.fit(method, images, images)
+    assert trainer.global_step == 4
+    for key, value in method.trunk.state_dict().items():
+        assert torch.equal(value, before[key]) != key.startswith("geometry."), key

@@ -86,6 +86,7 @@ class ResNet(nn.Module):
         if frozen:
             for name, parameter in self.named_parameters():
                 parameter.requires_grad = name.startswith("geometry.")
+            self.train()  # modules begin in training mode without this call, and Lightning keeps it
 
     def train(self, mode: bool = True) -> "ResNet":
         """Set training mode; a frozen trunk keeps its loaded batch statistics."""
