@@ -47,6 +47,7 @@ SHIPPED = "weights/003_cracker_box.ckpt"  # of pose_pf
 MEMORISED = "memorize/experiment=memorize,model={},seed=0,variant=working"
 HELD_OUT = "held_out/model={},seed=0"
 OTHER_RUN = "objects/{}/*model={},*"  # its name is cut
+SELF_SUPERVISED = "outputs/self_supervised/resnet18.pt"  # of bench/self_supervised.py
 SPARSE_RUN = "sparse/{}/*encoder={},*seed={},*"
 OTHER_OBJECTS = ("009_gelatin_box", "006_mustard_bottle", "004_sugar_box", "002_master_chef_can")
 POSE_ROWS = "model=pose_pf sweep=ablation_pose_pf"
@@ -163,6 +164,7 @@ def plan(meshes: str | None = None, frames: str | None = None) -> list[Line]:
     ]
     lines += [*list_pose_space(), *list_paper(), *list_choices(), *list_long()]
     lines += [*list_units_at_full_size(), *list_units_of_ablations(), *list_sparse()]
+    lines += list_pretrained()
     if meshes:
         box = f"{FOUR} experiment=cracker_box_pixels data.meshes={meshes} seed=0"
         lines.append(Line("cracker_box", box))
@@ -354,6 +356,30 @@ def list_sparse() -> list[Line]:
             for encoder, folder in (("unet", "unet"), ("foveated", "others"), ("none", "others"))
             for seed in range(3)
         ),
+    ]
+
+
+def list_pretrained() -> list[Line]:
+    """Return patch_pf on held-out scenes with features of a ResNet from random weights and from
+    those of bench/self_supervised.py, which must have made the file before, trained on and frozen;
+    beside the U-Net of the default. The trunk ends at a stride of 16 pixels, and a training has a
+    quarter of the preset's steps, for time. Muon turns all directions of a kernel at one rate, and
+    may so undo what was learned before: in the last line the trunk is left to AdamW.
+    """
+    patch = "model=patch_pf trainer.max_steps=1500 trainer.val_check_interval=1500"
+    resnet = f"{patch} model/encoder=resnet model.encoder.trunk.stages=3"
+    learned = f"model.encoder.trunk.weights={SELF_SUPERVISED}"
+    either = f"model.encoder.trunk.weights=null,{SELF_SUPERVISED}"
+    layers = "optimizer.adam_layers=[color,enter,modulate,outside,leave,out,trunk]"
+    return [
+        Line("pretrained", f"{resnet} seed=0,1,2 {either}", into="trained"),
+        Line(
+            "pretrained",
+            f"{resnet} seed=0,1,2 {learned} model.encoder.trunk.frozen=true",
+            into="frozen",
+        ),
+        Line("pretrained", f"{patch} seed=0,1,2 model/encoder=unet", into="unet"),
+        Line("pretrained", f"{resnet} seed=0,1,2 {either} {layers}", into="adamw"),
     ]
 
 

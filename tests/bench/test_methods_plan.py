@@ -27,7 +27,8 @@ def jobs(words: str) -> list[tuple[str, ...]]:
     pairs = [word.split("=", 1) for word in words.split()]
     return list(
         itertools.product(
-            *([f"{key}={value}" for value in values.split(",")] for key, values in pairs)
+            # a list is one value
+            *([f"{key}={x}" for x in re.split(r",(?![^\[]*\])", values)] for key, values in pairs)
         )
     )
 

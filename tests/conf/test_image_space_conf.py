@@ -95,6 +95,7 @@ REMEDIES = [
     "model/encoder=none",
     "model/encoder=pyramid",
     "model/encoder=resnet model.encoder.trunk.kind=resnet18",
+    "model/encoder=resnet model.encoder.trunk.stages=3 model.encoder.trunk.frozen=true",
     "model/glimpse=integer",
     "model.net.normalization=batch",
     "model/displacement=unbounded",

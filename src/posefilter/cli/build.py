@@ -223,6 +223,7 @@ def quiet() -> None:
         ".*Checkpoint directory.*",
         ".*log_every_n_steps.*",
         ".*sync_dist=True.*",  # each process validates all images
+        ".*in eval mode at the start of training.*",  # the statistics of a frozen trunk
     ):
         warnings.filterwarnings("ignore", text)
     torch.set_float32_matmul_precision("highest")  # TF32 would cost a pose at 1 m half a millimeter

@@ -264,9 +264,11 @@ class UNetEncoder(_Encoder, UNet):
 class ResNetEncoder(_Encoder):
     """A ResNet trunk with a top-down path to stride 4 (feature pyramid network, Lin et al. 2017).
 
+    It runs in bfloat16 where the hardware supports it (float32 in, float32 out).
+
     Args:
-        trunk: Maps color in [0, 1] and 7 geometry channels at half resolution to maps of strides 4,
-            8, 16 and 32.
+        trunk: Maps color in [0, 1] and 7 geometry channels at half resolution to maps of doubling
+            strides, of which the first is 4.
         width: Features of a particle.
     """
 
@@ -279,8 +281,11 @@ class ResNetEncoder(_Encoder):
 
     def forward(self, rgb: Tensor, depth: Tensor, K: Tensor) -> ContextMap:
         """Return one map of stride 4."""
-        maps = self.trunk(rgb, geometry(depth, K))
-        top = self.lateral[-1](maps[-1])
-        for lateral, low in zip(reversed(self.lateral[:-1]), reversed(maps[:-1]), strict=True):
-            top = lateral(low) + upsample_like(top, low)
-        return self._map(self.smooth(top), 4)
+        shape = geometry(depth, K)
+        with in_bfloat16(rgb):
+            maps = self.trunk(rgb.contiguous(memory_format=torch.channels_last), shape)
+            top = self.lateral[-1](maps[-1])
+            for lateral, low in zip(reversed(self.lateral[:-1]), reversed(maps[:-1]), strict=True):
+                top = lateral(low) + upsample_like(top, low)
+            top = self.smooth(top)
+        return self._map(top, 4)

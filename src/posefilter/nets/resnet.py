@@ -9,6 +9,7 @@ from torch import Tensor, nn
 
 from posefilter.errors import UserError, check_choice
 
+CHANNELS = (64, 128, 256, 512)  # of the stages, whose strides are 4, 8, 16 and 32
 DEPTHS = {"resnet18": (2, 2, 2, 2), "resnet34": (3, 4, 6, 3)}
 # statistics of ImageNet's colors, which published weights expect
 MEAN, STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
@@ -43,17 +44,27 @@ class ResNet(nn.Module):
         weights: A state dict's file or URL, whose classifier (`fc`) is ignored; None for random
             weights.
         frozen: Train the geometry stem only; batch statistics stay as loaded.
+        stages: How many of the four stages there are; a file's later ones are ignored.
+
+    Raises:
+        UserError: There is no such kind or number of stages, or the file does not fit.
     """
 
-    channels = (64, 128, 256, 512)
     mean: Tensor
     std: Tensor
 
     def __init__(
-        self, kind: str = "resnet18", weights: str | None = None, frozen: bool = False
+        self,
+        kind: str = "resnet18",
+        weights: str | None = None,
+        frozen: bool = False,
+        stages: int = 4,
     ) -> None:
         super().__init__()
         check_choice("model.encoder.trunk.kind", kind, *DEPTHS)
+        if not 1 <= stages <= len(CHANNELS):
+            raise UserError(f"model.encoder.trunk.stages={stages}: must be 1 to {len(CHANNELS)}")
+        self.channels = CHANNELS[:stages]
         self.conv1 = nn.Conv2d(3, 64, 7, 2, padding=3, bias=False)
         self.bn1 = nn.BatchNorm2d(64)
         self.geometry = nn.Conv2d(7, 64, 7, padding=3)
@@ -61,7 +72,7 @@ class ResNet(nn.Module):
         nn.init.zeros_(self.geometry.bias)  # type: ignore[arg-type]
         inputs = 64
         for i, (outputs, depth) in enumerate(
-            zip(self.channels, DEPTHS[kind], strict=True), start=1
+            zip(self.channels, DEPTHS[kind][:stages], strict=True), start=1
         ):
             blocks = [BasicBlock(inputs, outputs, 1 if i == 1 else 2)]
             blocks += [BasicBlock(outputs, outputs, 1) for _ in range(depth - 1)]
@@ -75,6 +86,7 @@ class ResNet(nn.Module):
         if frozen:
             for name, parameter in self.named_parameters():
                 parameter.requires_grad = name.startswith("geometry.")
+            self.train()  # modules begin in training mode without this call, and Lightning keeps it
 
     def train(self, mode: bool = True) -> "ResNet":
         """Set training mode; a frozen trunk keeps its loaded batch statistics."""
@@ -86,12 +98,12 @@ class ResNet(nn.Module):
         return self
 
     def forward(self, rgb: Tensor, geometry: Tensor) -> list[Tensor]:
-        """(B, 3, H, W) in [0, 1], (B, 7, H / 2, W / 2) rounded up -> maps of strides 4 to 32."""
+        """(B, 3, H, W) in [0, 1], (B, 7, H / 2, W / 2) rounded up -> a map of each stage."""
         x = self.conv1((rgb - self.mean) / self.std)
         x = torch.relu(self.bn1(x + self.geometry(geometry)))
         x = torch.max_pool2d(x, 3, stride=2, padding=1)
         maps = []
-        for i in range(1, 5):
+        for i in range(1, len(self.channels) + 1):
             x = getattr(self, f"layer{i}")(x)
             maps.append(x)
         return maps
@@ -124,16 +136,20 @@ def load_trunk(trunk: ResNet, weights: str) -> None:
     ):
         raise UserError(f"{said}: should hold tensors by name, as torchvision's files do")
     own = {name for name in trunk.state_dict() if not name.startswith("geometry.")}
-    missing = sorted(own - state.keys())
-    unexpected = sorted(name for name in state.keys() - own if not name.startswith("fc."))
+    # a count of batches that earlier files lack, and that evaluation does not read
+    counts = {name for name in own if name.endswith(".num_batches_tracked")}
+    missing = sorted(own - counts - state.keys())
+    not_needed = ("fc.", *(f"layer{i}." for i in range(len(trunk.channels) + 1, 5)))
+    unexpected = sorted(name for name in state.keys() - own if not name.startswith(not_needed))
     if missing or unexpected:
         name = (missing or unexpected)[0]
         what = "lacks" if missing else "has the unexpected"
         raise UserError(f"{said}: {what} {name}; is it another network than trunk.kind says?")
+    known = {name: state[name] for name in own & state.keys()}
     for name, value in trunk.state_dict().items():
-        if name in own and state[name].shape != value.shape:
+        if name in known and known[name].shape != value.shape:
             raise UserError(
-                f"{said}: its {name} has shape {tuple(state[name].shape)}, not "
+                f"{said}: its {name} has shape {tuple(known[name].shape)}, not "
                 f"{tuple(value.shape)}; is it another network than trunk.kind says?"
             )
-    trunk.load_state_dict({**trunk.state_dict(), **{name: state[name] for name in own}})
+    trunk.load_state_dict({**trunk.state_dict(), **known})
