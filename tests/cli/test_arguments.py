@@ -381,3 +381,21 @@ def test_a_file_that_is_there_needs_no_quotes(
     (parsed,) = OverridesParser.create().parse_overrides(quoted([f"rgb={name}"]))
     assert parsed.value() == name
     assert quoted([f"seed={name}"]) == [f"seed={name}"]  # no setting that names a file
+
+
+@pytest.mark.parametrize(
+    "typed", [["--rgb", "a.png"], ["--rgb=a.png"], ["seed=1", "--rgb", "a.png"]]
+)
+def test_a_setting_typed_as_an_option_is_told_how_it_is_typed(typed: list[str]) -> None:
+    with pytest.raises(UserError, match="--rgb: is no option; settings are typed rgb="):
+        options_first(typed)
+    assert options_first(["seed=1", "--multi"]) == ["--multi", "seed=1"]  # Hydra's, cut short
+
+
+@pytest.mark.parametrize("typed", ["folder", "/path/to/run"])
+def test_a_word_without_a_key_is_told_how_settings_are_typed(
+    typed: str, capfd: pytest.CaptureFixture[str]
+) -> None:
+    assert run_command("report", HOME, [typed]) == 2
+    (line,) = capfd.readouterr().err.splitlines()
+    assert "settings are typed key=value, without blanks about =" in line

@@ -202,6 +202,28 @@ def test_of_equal_scores_the_first_estimate_counts(scenes: Path, tmp_path: Path)
     assert evaluate([*far, *rows], scenes, tmp_path / "last")["bop"]["ar"] == 0
 
 
+def test_targets_in_images_that_cannot_be_read_are_left_out_where_such_are_skipped(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    scene = tmp_path / "bop" / "test" / "000003"
+    bop_scene(scene, [[(5, pose())], [(5, pose())], [(5, pose())]])
+    write_mesh(tmp_path / "meshes", "obj_000005")
+    sorted((scene / "depth").iterdir())[1].unlink()
+    targets = [{"scene_id": 3, "im_id": n, "obj_id": 5, "inst_count": 1} for n in range(3)]
+    (tmp_path / "bop" / "targets.json").write_text(json.dumps(targets))
+    write_poses_csv(tmp_path / "poses.csv", [PoseRow(3, n, 5, 1.0, pose(), 1.0) for n in range(3)])
+    typed = [f"estimates={tmp_path / 'poses.csv'}", "targets=targets.json", "data=bop"]
+    typed += [f"data.root={tmp_path / 'bop'}", f"data.meshes={tmp_path / 'meshes'}"]
+    typed += ["data.options.split=test", "data.mesh_scale=1"]
+    assert run_command("evaluate", arguments=[*typed, f"out={tmp_path / 'all'}"]) == 2
+    assert "data.on_error=skip leaves such frames out" in capfd.readouterr().err
+    skip = [*typed, "data.on_error=skip", f"out={tmp_path / 'out'}"]
+    assert run_command("evaluate", arguments=skip) == 0
+    found = json.loads((tmp_path / "out" / "metrics.json").read_text())["bop"]
+    assert (found["ar"], found["targets"], found["left_out"]) == (100, 2, 1)
+    assert "does not compare with the challenge's" in " ".join("".join(capfd.readouterr()).split())
+
+
 def test_a_file_of_targets_is_the_split_that_is_tested(
     tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:

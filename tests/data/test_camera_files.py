@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from posefilter.cli.predict import read_intrinsics
+from posefilter.cli.predict import check_depth_scale, read_intrinsics
 from posefilter.data.camera_files import read_camera_file
 from posefilter.errors import BadData, UserError
 
@@ -41,6 +41,7 @@ SIZE = (480, 640)
             None,
         ),
         ("rows.json", {"K": K}, None),
+        ("bare.json", K, None),
         ("scene_camera.json", {"0": {"cam_K": K.ravel()}, "7": {"cam_K": K.ravel()}}, None),
         ("info.yaml", f"height: 480\nwidth: 640\nk: {K.ravel().tolist()}\nd: []\n", SIZE),
         ("calibration.yml", ROS, SIZE),
@@ -82,6 +83,30 @@ def test_what_is_no_camera_is_told(name: str, content: str, told: str, tmp_path:
         read_camera_file(tmp_path / name)
     assert name in str(caught.value)
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("content", "default", "refused"),
+    [
+        (FOUR | {"depth_scale": 0.1}, 10000, False),  # of BOP: millimeters a unit
+        (FOUR | {"depth_scale": 1.0}, 10000, True),
+        (FOUR | {"depth_scale": 1.0}, 1000, False),
+        (FOUR | {"depth_scale": 1000}, 1000, False),  # units in a meter
+        (FOUR | {"depth_scale": 0.001}, 1000, False),  # meters a unit
+        ({"0": {"cam_K": K.ravel(), "depth_scale": 1.0}}, 10000, True),
+        (FOUR, 10000, False),
+    ],
+)
+def test_another_depth_scale_than_the_default_is_asked_for(
+    content: Any, default: float, refused: bool, tmp_path: Path
+) -> None:
+    (tmp_path / "camera.json").write_text(json.dumps(content, default=np.ndarray.tolist))
+    camera = read_camera_file(tmp_path / "camera.json")
+    if not refused:
+        check_depth_scale(camera, default, "intrinsics=camera.json")
+        return
+    with pytest.raises(UserError, match=r"its depth_scale is 1, which .* depth_scale=1000 here"):
+        check_depth_scale(camera, default, "intrinsics=camera.json")
 
 
 def test_cameras_that_differ_from_image_to_image_are_told(tmp_path: Path) -> None:
@@ -166,6 +191,8 @@ def test_numbers_are_four_or_a_matrix() -> None:
     for wrong in ("1,2,3", [*K.T.ravel()], "none.json", "1,2,x,4", None):
         with pytest.raises(UserError, match=r"^intrinsics="):
             read_intrinsics(wrong)
+    with pytest.raises(UserError, match=r"intrinsics=none\.json: no such file"):
+        read_intrinsics("none.json")
 
 
 def test_a_matrix_that_numpy_saved_is_read(tmp_path: Path) -> None:

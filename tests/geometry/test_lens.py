@@ -129,6 +129,10 @@ def test_images_that_cannot_be_resampled_are_refused() -> None:
     rgb, depth = np.zeros((4, 5, 3), np.uint8), np.zeros((4, 5), np.float32)
     with pytest.raises(UserError, match="camera matrix"):
         undistort(rgb, depth, K[0], BROWN)
+    with pytest.raises(UserError, match="depth: expected an array of NumPy, not NoneType"):
+        undistort(rgb, None, K, BROWN)  # type: ignore[arg-type]
+    with pytest.raises(UserError, match=r"not \(H, W, 3\)"):
+        undistort(np.moveaxis(rgb, -1, 0), depth, K, BROWN)
     for wrong in (np.transpose(K), np.zeros((3, 3))):  # zeros: ROS, of a camera without calibration
         for matrices in ((wrong, BROWN), (K, BROWN, False, wrong)):
             with pytest.raises(UserError, match=r"^intrinsics: are no camera matrix"):

@@ -17,6 +17,10 @@ _VALUED = (
     *("--config-dir", "-cd", "--shell-completion-for", "--experimental-rerun"),
 )
 _INFO = ("--info", "-i")
+_LONG = (  # Hydra's options that are spelled out, which may be cut short
+    *(one for one in (*MULTIRUN, *_VALUED, *_INFO) if one.startswith("--")),
+    *("--help", "--hydra-help", "--version", "--resolve", "--run", "--shell-completion"),
+)
 _KINDS = ("all", "config", "defaults", "defaults-tree", "plugins", "searchpath")  # of information
 # settings that name files and folders, whatever the command, and what Hydra reads as a number
 _PLACES = (
@@ -36,6 +40,9 @@ TYPED = {"sweep_folder": "sweep"}  # settings whose name is another than what is
 def options_first(arguments: Sequence[str]) -> list[str]:
     """Return a command line with its options before all settings: Hydra's parser does not find
     settings on both sides of an option.
+
+    Raises:
+        UserError: An option is none of Hydra's, as where a setting is typed as one.
     """
     options, settings, left = list[str](), list[str](), list(arguments)
     while left:
@@ -43,6 +50,10 @@ def options_first(arguments: Sequence[str]) -> list[str]:
         if not word.startswith("-"):
             settings.append(word)
             continue
+        name, _, value = word.partition("=")
+        if name.startswith("--") and not any(one.startswith(name) for one in _LONG):
+            own = name.lstrip("-")
+            raise UserError(f"{name}: is no option; settings are typed {own}={value or '...'}")
         options.append(word)
         if word in _INFO:  # whose value may be left out
             options.append(left.pop(0) if left and left[0] in _KINDS else _KINDS[0])

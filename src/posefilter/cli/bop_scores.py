@@ -12,7 +12,7 @@ from torch import Tensor
 from posefilter.data.frames import FrameRecord, NotShown, Sample
 from posefilter.data.module import PoseDataModule
 from posefilter.data.readers.base import BaseReader
-from posefilter.errors import UserError
+from posefilter.errors import BadData, UserError
 from posefilter.geometry.symmetries import densify
 from posefilter.meshes.mesh import Mesh, hull_vertices
 from posefilter.metrics.bop import REFERENCE_WIDTH, mspd_of_vertices, mssd
@@ -76,7 +76,8 @@ def score_targets(
         data: Their dataset, with the meshes of its objects.
 
     Returns:
-        {"ar", "ar_vsd", "ar_mssd", "ar_mspd", "targets", "estimates"}; recalls in [0, 100].
+        {"ar", "ar_vsd", "ar_mssd", "ar_mspd", "targets", "estimates", "left_out"}; recalls in
+        [0, 100]. The last counts objects in images that cannot be read, where such are skipped.
 
     Raises:
         UserError: A target is not in the data, or an object has no mesh.
@@ -87,13 +88,19 @@ def score_targets(
     place = {record.key: i for i, record in enumerate(data.reader.records())}
     by_key = sort_rows(rows)
     judge = _Judge(data)
-    scored, used = list[TargetErrors](), 0
+    scored, used, left_out = list[TargetErrors](), 0, 0
     for key in groups if counts is None else counts:
         if key not in groups:
             names = dict(zip(Target._fields, key, strict=False))
-            left_out = "" if key[2] in classes else " (data.object=null takes all objects)"
-            raise UserError(f"targets: the data have no instance of {names}{left_out}")
-        samples = _read_shown([place[record.key] for record in groups[key]], data.reader)
+            hint = "" if key[2] in classes else " (data.object=null takes all objects)"
+            raise UserError(f"targets: the data have no instance of {names}{hint}")
+        try:
+            samples = _read_shown([place[record.key] for record in groups[key]], data.reader)
+        except BadData:
+            if data.reader.on_error != "skip":
+                raise
+            left_out += 1
+            continue
         shares = [data.reader.visible_share(sample) for sample in samples]
         order = np.argsort(-np.nan_to_num(shares, nan=1.0), kind="stable").tolist()
         if counts is None:
@@ -105,7 +112,8 @@ def score_targets(
             used += len(known)
             scored.append(judge.score([samples[i] for i in order], known))
     count = sum(one.mssd.shape[1] for one in scored)
-    return {**compute_average_recall(scored), "targets": count, "estimates": used}
+    counted = {"targets": count, "estimates": used, "left_out": left_out}
+    return {**compute_average_recall(scored), **counted}
 
 
 def _read_shown(places: Sequence[int], reader: BaseReader) -> list[Sample]:

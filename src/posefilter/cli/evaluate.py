@@ -223,6 +223,12 @@ def _of_estimates(job: Job) -> tuple[dict[str, Any], dict[str, Path]]:
     results["belief"] = None
     if job.cfg.targets is not None:
         results["bop"] = score_targets(rows, targets, data.records("test"), data)
+        if count := results["bop"]["left_out"]:
+            sentence = (
+                f"{count} of the targets are in images that cannot be read: the recall is of the "
+                "others, and does not compare with the challenge's"
+            )
+            warn(job.cfg.console, sentence, left_out=count)
     write_errors(job.folder / ERRORS, table)
     metrics = {**record(results, job, data.describe(), None), "estimates": str(job.cfg.estimates)}
     return metrics, {"errors": job.folder / ERRORS}

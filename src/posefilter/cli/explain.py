@@ -119,7 +119,9 @@ def _tell_quotes(argument: str) -> str:
     """Return how an argument is typed whose value is one text, with signs that Hydra reads."""
     key, found, value = argument.partition("=")
     if not found:
-        return ""
+        return (
+            "; settings are typed key=value, without blanks about =, a path with blanks in quotes"
+        )
     if form := _FORMS.get(key):
         return f"; it is typed {key}={form}"
     text = f"{key}={quote(value)}"

@@ -16,6 +16,7 @@ from posefilter.cli.components import changes
 from posefilter.cli.console import JSON, ended
 from posefilter.cli.job import Job
 from posefilter.cli.machine import settle
+from posefilter.cli.plain import key_of
 from posefilter.cli.results import write_json
 from posefilter.cli.shapes import load_shape, open_shapes
 from posefilter.confidence.tolerance import PoseTolerance, read_pose_tolerance
@@ -90,7 +91,7 @@ def predict_one(job: Job) -> list[Result]:
     costs, tolerance = read_costs(cfg), read_pose_tolerance(cfg.pose_tolerance)
     method = method_of(read_checkpoint(cfg.checkpoint), changes(cfg), lightning=False)
     estimator = Estimator([method], pose_tolerance=tolerance)
-    rgb, depth, K = read_inputs(cfg)
+    rgb, depth, K = read_inputs(job)
     shape = load_shape(open_shapes(cfg, [method.object_model.name]), method.object_model)
     images, _ = check_images(rgb, depth, K)
     (run,) = estimator.run(images, cfg.seed)
@@ -134,7 +135,7 @@ def predict_several(job: Job) -> list[Result]:
     estimator = Estimator(methods, costs=costs, pose_tolerance=tolerance)
     if cfg.instances is not None:
         check_once(estimator.objects)
-    rgb, depth, K = read_inputs(cfg)
+    rgb, depth, K = read_inputs(job)
     store = open_shapes(cfg, estimator.objects)
     if cfg.instances is None:
         (results,) = estimator.predict_batch(rgb[None], depth[None], K, seed=cfg.seed)
@@ -339,19 +340,42 @@ def describe_absent(
     }
 
 
-def read_inputs(cfg: DictConfig) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def read_inputs(job: Job) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return color (H, W, 3) uint8, depth (H, W) [m] and K (3, 3) [px], of the rectified image.
 
     Raises UserError where one is missing or they do not fit each other.
     """
+    cfg = job.cfg
     rgb, depth = read_photograph(cfg.rgb, cfg.depth, cfg.depth_scale)
     camera = read_intrinsics(cfg.intrinsics, cfg.distortion is not None)
+    if not holds_meters(Path(cfg.depth)) and "depth_scale" not in map(key_of, job.overrides):
+        check_depth_scale(camera, cfg.depth_scale, f"intrinsics={cfg.intrinsics}")
     K = camera.K
     if camera.size is not None:
         expect_size(Path(cfg.rgb), rgb, *camera.size, f"intrinsics={cfg.intrinsics}")
     if cfg.distortion is not None:
         rgb, depth = undistort_most(rgb, depth, K, parse_distortion(cfg.distortion))
     return rgb, depth, K
+
+
+def check_depth_scale(camera: CameraFile, units: float, said: str) -> None:
+    """Raise UserError where the camera's file has another depth scale than the default.
+
+    Args:
+        camera: The camera.
+        units: Units of the depth files in a meter, which nobody typed.
+        said: The setting that names the file.
+    """
+    own = camera.depth_scale
+    # of BOP millimeters a unit, of others units in a meter, or meters a unit
+    if own is None or any(
+        math.isclose(units, one, rel_tol=1e-3) for one in (1000 / own, own, 1 / own)
+    ):
+        return
+    raise UserError(
+        f"{said}: its depth_scale is {own:g}, which for BOP's files means depth_scale="
+        f"{1000 / own:g} here, and {units:g} is the default; type depth_scale="
+    )
 
 
 def parse_distortion(numbers: Any) -> tuple[float, ...]:
@@ -402,11 +426,14 @@ def read_intrinsics(typed: Any, distorted: bool = False) -> CameraFile:
     try:
         values = [float(part) for part in parts]
     except (TypeError, ValueError) as error:
-        if len(parts) > 1 or not Path(str(parts[0])).exists():
+        file = str(parts[0])
+        if len(parts) == 1 and Path(file).suffix and not Path(file).exists():
+            raise UserError(f"intrinsics={typed}: no such file") from error
+        if len(parts) > 1 or not Path(file).exists():
             raise UserError(
                 f"intrinsics={typed}: expected four numbers, fx,fy,cx,cy [px], or a camera's file"
             ) from error
-        return _read_camera(Path(str(parts[0])), distorted)
+        return _read_camera(Path(file), distorted)
     if len(values) not in (4, 9):
         raise UserError(f"intrinsics={typed}: expected four numbers, fx,fy,cx,cy [px]")
     if not np.isfinite(values).all():

@@ -17,7 +17,7 @@ from posefilter.cli.doubts import say_commonest, say_doubt
 from posefilter.cli.job import Job
 from posefilter.cli.machine import settle
 from posefilter.cli.plain import resolve
-from posefilter.cli.predict import parse_distortion, read_intrinsics
+from posefilter.cli.predict import check_depth_scale, parse_distortion, read_intrinsics
 from posefilter.cli.results import write_json
 from posefilter.cli.shapes import load_shape, open_shapes
 from posefilter.cli.track_log import POSES, TrackLog, check_unused
@@ -241,6 +241,8 @@ def open_videos(cfg: DictConfig, objects: Sequence[str]) -> tuple[Sequence[Video
     if cfg.frames:
         camera = read_intrinsics(cfg.intrinsics, cfg.distortion is not None)
         scale = float(cfg.depth_scale or _DEPTH_SCALE)
+        if cfg.depth_scale is None:
+            check_depth_scale(camera, scale, f"intrinsics={cfg.intrinsics}")
         lens = None if cfg.distortion is None else parse_distortion(cfg.distortion)
         folder = Path(str(cfg.frames))
         skip = cfg.on_error == "skip"

@@ -31,6 +31,7 @@ class CameraFile(NamedTuple):
     distortion: tuple[float, ...] = ()  # of its lens, in OpenCV's order
     other_model: str = ""  # the distortion's kind, where that is not OpenCV's polynomial
     rectified: np.ndarray | None = None  # (3, 3) of its rectified images, where the file has one
+    depth_scale: float | None = None  # as the file has it, whose unit differs between formats
 
 
 def read_camera_file(path: Path) -> CameraFile:
@@ -63,6 +64,11 @@ def read_camera_file(path: Path) -> CameraFile:
 
 
 def _of_mapping(content: Any, path: Path) -> CameraFile:
+    if (
+        isinstance(content, list)
+        and [len(row) for row in content if isinstance(row, list)] == [3] * 3
+    ):
+        content = {"K": content}
     if not isinstance(content, Mapping):
         raise BadData(path, "holds no camera", "expected fx, fy, cx, cy or a matrix by name")
     inner = (content[key] for key in _INNER if isinstance(content.get(key), Mapping))
@@ -75,7 +81,9 @@ def _of_mapping(content: Any, path: Path) -> CameraFile:
         cameras = np.stack([numbers(one, "cam_K", path, (3, 3)) for one in images])
         if np.ptp(cameras, axis=0).max() > 1e-6:
             raise BadData(path, "has another camera for each image", "type its numbers")
-        return CameraFile(_orient(cameras[0], path))
+        scales = {_find_scale(one, path) for one in images}
+        scale = scales.pop() if len(scales) == 1 else None
+        return CameraFile(_orient(cameras[0], path), depth_scale=scale)
     some = ", ".join(map(str, [*content][:6]))
     raise BadData(path, "holds no camera", f"expected fx, fy, cx, cy or a matrix; it has {some}")
 
@@ -96,9 +104,17 @@ def _of_camera(content: Mapping[str, Any], K: np.ndarray, path: Path) -> CameraF
     projection = _listed(content, _PROJECTIONS)
     P = None if projection is None else numbers(projection, "data", path, (3, 4))
     rectified = None if P is None or P[0, 0] <= 0 else P[:, :3]
+    scale = _find_scale(content, path)
     if not any(coefficients):
-        return CameraFile(K, size, rectified=rectified)
-    return CameraFile(K, size, coefficients, _find_other_model(content), rectified)
+        return CameraFile(K, size, rectified=rectified, depth_scale=scale)
+    return CameraFile(K, size, coefficients, _find_other_model(content), rectified, scale)
+
+
+def _find_scale(content: Mapping[str, Any], path: Path) -> float | None:
+    if content.get("depth_scale") is None:
+        return None
+    scale = float(numbers(content, "depth_scale", path, ()))
+    return scale if scale > 0 else None
 
 
 def _find_named(content: Mapping[str, Any], path: Path) -> tuple[float, ...]:

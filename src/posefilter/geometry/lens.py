@@ -48,11 +48,17 @@ def undistort(
         UserError: There are not as many coefficients, or they are no numbers; or intrinsics are no
             camera matrix; or the shapes differ, or a type cannot be resampled.
     """
-    height, width = depth.shape[:2]
+    for name, one in (("rgb", rgb), ("depth", depth)):
+        if not isinstance(one, np.ndarray):
+            raise UserError(f"{name}: expected an array of NumPy, not {type(one).__name__}")
+    if rgb.ndim > 3 or depth.ndim != 2:
+        raise UserError(
+            f"rgb, depth: have shapes {rgb.shape} and {depth.shape}; expected one image (H, W, 3) "
+            "and (H, W)"
+        )
+    height, width = depth.shape
     if rgb.shape[:2] != (height, width):
-        raise UserError(f"depth: has shape {depth.shape}, but rgb {rgb.shape}")
-    if rgb.ndim > 3:
-        raise UserError(f"rgb: has shape {rgb.shape}; expected one image (H, W, 3)")
+        raise UserError(f"depth: has shape {depth.shape}, but rgb {rgb.shape}, not (H, W, 3)")
     K, wanted = (
         tuple(check_camera_matrix(one).ravel().tolist())
         for one in (intrinsics, intrinsics if new_intrinsics is None else new_intrinsics)
