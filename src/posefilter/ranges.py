@@ -267,6 +267,8 @@ RANGES: dict[str, Range] = {
     **_each("loss", POSITIVE, "scale", "sigma"),
     "terms.mask.sigma": POSITIVE,
     "terms.mask.max_pixels": COUNT,
+    "model.translation_mm": POSITIVE,
+    "model.rotation_deg": Range(0, 180, above=True),
     "terms.pose.translation_mm": POSITIVE,
     "terms.pose.rotation_deg": Range(0, 180, above=True),
     "loss.gamma": Range(0, 100),
