@@ -39,7 +39,8 @@ BY_PARTS = (
     "model._target_=posefilter.models.parts_pf.PartsPF",
     "filter/resample=within_parts",
 )
-FILTERS = {"pose_pf": (), "parts_pf": BY_PARTS}  # on the same weights
+WIDE = ("model.translation_mm=1e5", "model.rotation_deg=1e5")  # messages that say nothing
+FILTERS = {"pose_pf": (), "parts_pf": BY_PARTS, "no_messages": (*BY_PARTS, *WIDE)}
 ENDS = {"refined": (), "plain": ("filter/refine=none",)}
 ERRORS = {"ADD AUC": ("add", "auc"), "ADD-S AUC": ("add_s", "auc")}
 IOUS = {"part box IoU": ("parts", "box_iou"), "part mask IoU": ("parts", "mask_iou")}
