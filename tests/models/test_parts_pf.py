@@ -2,13 +2,17 @@
 
 import math
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
+from omegaconf import OmegaConf
 from tests.models.toy import SIDE, scenes, square
 from torch import Tensor
 
+from posefilter.cli.checkpoints import build_method, method_of, recipe
+from posefilter.cli.command import compose_job
 from posefilter.errors import UserError
 from posefilter.filters.candidates import perturb
 from posefilter.filters.estimate import Argmax
@@ -28,6 +32,8 @@ from posefilter.nets.likelihood import PoseLikelihood, Region
 from posefilter.nets.proposals import ObjectCoordinateNet
 from posefilter.nets.surface_term import SurfaceTerm
 from posefilter.types import ObjectModel, Step
+
+CONF = Path(__file__).parents[2] / "conf"
 
 
 def halves() -> ObjectModel:
@@ -216,3 +222,20 @@ def test_resampling_over_all_particles_is_refused() -> None:
 def test_a_kernel_without_width_is_refused(name: str) -> None:
     with pytest.raises(UserError, match=rf"{name}=0"):
         parts_pf(**{name: 0.0})
+
+
+def test_weights_of_pose_pf_are_tested_by_parts() -> None:
+    """As by `evaluate.py checkpoint=... model._target_=...PartsPF filter/resample=within_parts`."""
+    plain = build_method(recipe(compose_job("train", CONF, ["model=pose_pf"], Path("nowhere"))))
+    plain.set_object(halves())
+    checkpoint: dict[str, Any] = {"state_dict": plain.state_dict()}
+    plain.on_save_checkpoint(checkpoint)
+    scheme = OmegaConf.to_container(OmegaConf.load(CONF / "filter/resample/within_parts.yaml"))
+    by_parts = {"_target_": "posefilter.models.parts_pf.PartsPF", "translation_mm": 9.0}
+    wanted = {"model": by_parts, "filter": {"resample": scheme}}
+    found = method_of(checkpoint, wanted, lightning=False)
+    assert isinstance(found, PartsPF)
+    assert (found.translation_mm, found.space.parts) == (9.0, 2)
+    assert all(torch.equal(found.state_dict()[k], v) for k, v in plain.state_dict().items())
+    with pytest.raises(UserError, match="filter/resample=within_parts"):
+        method_of(checkpoint, {"model": by_parts}, lightning=False)
