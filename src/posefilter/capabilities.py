@@ -28,9 +28,11 @@ MEANINGS: Mapping[str, str] = {
     "free_latent": "a latent that is no input of the network",
     "grid_scores": "training on crops scored against rotations",
     "image_patches": "particles that see a patch of the image",
+    "score_parts": "a likelihood that scores a part of the object",
     "score_points": "a likelihood that scores single image points",
     "score_samples": "a likelihood that scores colored points by themselves",
     "object_coordinates": "a network that predicts object coordinates",
+    "parts": "a method whose particles are of the object's parts",
     "pixel_space": "particles that are pixels",
     "pose": "particles with a pose",
     "pose_space": "particles that are poses",
@@ -42,6 +44,7 @@ MEANINGS: Mapping[str, str] = {
     "score_poses": "a method that scores any pose",
     "surface_point_loss": "a loss on each particle's predicted object point",
     "surface_points": "particles with a measured point of the object",
+    "within_parts": "resampling within each part's particles",
 }
 
 

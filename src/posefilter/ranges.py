@@ -267,6 +267,7 @@ RANGES: dict[str, Range] = {
     **_each("loss", POSITIVE, "scale", "sigma"),
     "terms.mask.sigma": POSITIVE,
     "terms.mask.max_pixels": COUNT,
+    **_each("model", POSITIVE, "translation_mm", "rotation_deg"),  # wide: no messages
     "terms.pose.translation_mm": POSITIVE,
     "terms.pose.rotation_deg": Range(0, 180, above=True),
     "loss.gamma": Range(0, 100),

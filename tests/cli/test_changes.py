@@ -55,6 +55,17 @@ def test_a_setting_that_earlier_recipes_leave_out_is_taken(tmp_path: Path) -> No
         change("filter.look=1", tmp_path)
 
 
+def test_another_class_of_the_method_keeps_what_it_is_made_of(tmp_path: Path) -> None:
+    """It may have settings of its own: `model._target_=...PartsPF model.translation_mm=9`."""
+    trained = {"model": {"_target_": "PosePF", "pixels": 32, "likelihood": {"_target_": "A"}}}
+    typed = ["++model._target_=PartsPF", "++model.translation_mm=9"]
+    found = changed(trained, changes(compose_job("evaluate", CONF, typed, tmp_path).cfg))["model"]
+    own = {"_target_": "PartsPF", "translation_mm": 9, "pixels": 32}
+    assert found == {**own, "likelihood": {"_target_": "A"}}
+    with pytest.raises(UserError, match=r"model\.translation_mm: the checkpoint's"):
+        changed(trained, {"model": {"translation_mm": 9}})
+
+
 def test_a_calibration_holds_for_fewer_searches_and_for_what_is_left_out() -> None:
     own = {"filter": {"particles": 50, "max_searches": 3}}
     assert is_calibrated_filter({"filter": {"particles": 50, "zoom_diameter": None}}, own)

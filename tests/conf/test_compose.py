@@ -33,11 +33,7 @@ HOME = Path(__file__).parents[2]
 CONF = HOME / "conf"
 MODELS = list_choices(CONF / "model")
 VARIANTS = list_choices(CONF / "variant")
-COMPARISONS = (
-    "dense_coordinates",
-    "keypoints",
-    "rotation_grid",
-)  # no filters, and not of the paper
+COMPARISONS = ("dense_coordinates", "keypoints", "parts_pf", "rotation_grid")  # not of the paper
 PRESETS = [
     (model, variant) for model in MODELS for variant in list_choices(CONF / "preset" / model)
 ]

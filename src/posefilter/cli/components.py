@@ -40,7 +40,8 @@ def chosen(job: Job) -> dict[str, str]:
 
 def changed(old: dict[str, Any], new: dict[str, Any], where: str = "") -> dict[str, Any]:
     """Return a checkpoint's settings with some changed: a component that is chosen anew is
-    replaced, any other section merged.
+    replaced, any other section merged. So is a method whose class is another, `model._target_=`,
+    which may have settings of its own.
 
     Args:
         old: What the method was trained with.
@@ -54,7 +55,7 @@ def changed(old: dict[str, Any], new: dict[str, Any], where: str = "") -> dict[s
     for key, value in new.items():
         place = f"{where}.{key}" if where else key
         if key not in merged:
-            if place in _LATER:
+            if place in _LATER or "_target_" in new:  # another class may have other settings
                 merged[key] = value
                 continue
             section = where or "method"
@@ -65,7 +66,12 @@ def changed(old: dict[str, Any], new: dict[str, Any], where: str = "") -> dict[s
         if isinstance(here, list) and isinstance(value, dict):  # `components.1.pixels=64`
             numbered = {str(number): one for number, one in enumerate(here)}
             merged[key] = list(changed(numbered, value, place).values())
-        elif isinstance(here, dict) and isinstance(value, dict) and "_target_" not in value:
+        elif (
+            isinstance(here, dict)
+            and isinstance(value, dict)
+            # the method itself has no group: `model._target_=` keeps what it is made of
+            and ("_target_" not in value or place in SECTIONS)
+        ):
             merged[key] = changed(here, value, place)
         else:
             merged[key] = value

@@ -5,6 +5,7 @@ A space perturbs, averages and compares states.
 
 from dataclasses import dataclass, field
 from functools import cache, cached_property
+from itertools import pairwise
 from typing import ClassVar
 
 import torch
@@ -122,3 +123,21 @@ class PoseSpace:
         turn = angle_between(rotation_of(a), rotation_of(b)) * self.radius
         # so that the gradient at equal poses is 0 and not NaN
         return (shift * shift + turn * turn).clamp_min(1e-30).sqrt()
+
+
+@dataclass(frozen=True)
+class PartsSpace(PoseSpace):
+    """Poses of an object as each of its parts sees them: particles come in a block for each part.
+
+    Args:
+        parts: Number of parts.
+    """
+
+    parts: int = 1
+
+    def split(self, count: int) -> list[slice]:
+        """Return which of `count` particles are of each part; the first blocks are longer by one
+        where the number is no multiple of the parts'.
+        """
+        ends = [(k * count + self.parts - 1) // self.parts for k in range(self.parts + 1)]
+        return [slice(*pair) for pair in pairwise(ends)]

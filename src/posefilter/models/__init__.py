@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from posefilter.models.dense_coordinates import DenseCoordinates as DenseCoordinates
     from posefilter.models.downsized import Downsized as Downsized
     from posefilter.models.keypoints import Keypoints as Keypoints
+    from posefilter.models.parts_pf import PartsPF as PartsPF
     from posefilter.models.patch_pf import PatchPF as PatchPF
     from posefilter.models.pixel_pf import PixelPF as PixelPF
     from posefilter.models.pose_pf import PosePF as PosePF
@@ -23,6 +24,7 @@ _HOMES = {
     "DenseCoordinates": "dense_coordinates",
     "Downsized": "downsized",
     "Keypoints": "keypoints",
+    "PartsPF": "parts_pf",
     "PatchPF": "patch_pf",
     "PixelPF": "pixel_pf",
     "PosePF": "pose_pf",

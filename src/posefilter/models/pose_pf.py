@@ -16,7 +16,7 @@ from posefilter.models.pose_particles import PoseParticles, require_depth
 from posefilter.nets.coordinates import Cells, Coordinates, coordinate_loss
 from posefilter.nets.fused import applies, make_tables
 from posefilter.nets.layers import fast_bfloat16
-from posefilter.nets.likelihood import Pixels, flatten_images
+from posefilter.nets.likelihood import Pixels, Region, flatten_images
 from posefilter.nets.pose_votes import draw_poses, measure_cells
 from posefilter.nets.proposals import ObjectCoordinateNet
 from posefilter.types import Batch, ObjectModel, ParticleOutput, Particles, Step, Trace
@@ -78,7 +78,8 @@ class PosePF(PoseParticles):
 
     provides: ClassVar[Capabilities] = ("color", "depth", "pose", "pose_space", "score_poses")
     # training rolls out no filter
-    test_only_settings = ("filter", "train_filter", "pixels", "quasi_monte_carlo")
+    test_only_settings: ClassVar[tuple[str, ...]] = ("filter", "train_filter", "pixels")
+    test_only_settings += ("quasi_monte_carlo",)
     # for comparing the scores of estimate and truth: image points, noise level [m]
     comparison_pixels, comparison_sigma = 4096, 0.004
 
@@ -256,14 +257,16 @@ class PosePF(PoseParticles):
         generator: Generator,
         pixels: int,
         fast: bool = False,
+        region: Region | None = None,
     ) -> Tensor:
-        """Score poses; if `fast`, in bfloat16 where that is fast: its error is far below the noise
-        of few pixels.
+        """Score poses, or a region of the object at them; if `fast`, in bfloat16 where that is
+        fast: its error is far below the noise of few pixels.
         """
         bfloat16 = torch.autocast(
             self.device.type, torch.bfloat16, enabled=fast_bfloat16(self.device)
         )
         with bfloat16 if fast else nullcontext():
             size = (self._center(), self.object_model.radius)
-            score: Tensor = self.likelihood(encoding.image, poses, sigma, *size, pixels, generator)
+            own = (pixels, generator) if region is None else (pixels, generator, region)
+            score: Tensor = self.likelihood(encoding.image, poses, sigma, *size, *own)
         return score.float() if fast else score

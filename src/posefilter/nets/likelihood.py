@@ -63,6 +63,14 @@ class Points(NamedTuple):
     context: Tensor | None = None  # (B, N, P, 5 + C), as returned by `query`
 
 
+class Region(NamedTuple):
+    """A part of the object's surface, which image points are drawn about."""
+
+    center: Tensor  # (3,) in the object's frame [m]
+    radius: float  # [m]
+    surface: Tensor  # (Q, 3) points of the part's surface [m], for `SurfaceTerm`
+
+
 def flatten_images(
     rgb: Tensor, depth: Tensor, K: Tensor, coordinates: Coordinates | None = None
 ) -> Pixels:
@@ -149,7 +157,7 @@ class PoseLikelihood(nn.Module):
         ray: Whether the network is given the viewing ray (in an ablation it is 0).
     """
 
-    provides: ClassVar[Capabilities] = ("common_points", "score_points")
+    provides: ClassVar[Capabilities] = ("common_points", "score_parts", "score_points")
 
     def __init__(
         self,
@@ -225,6 +233,7 @@ class PoseLikelihood(nn.Module):
         radius: float,
         pixels: int,
         generator: Generator,
+        region: Region | None = None,
     ) -> Tensor:
         """Score poses at noise levels.
 
@@ -236,6 +245,9 @@ class PoseLikelihood(nn.Module):
             radius: The object's radius [m].
             pixels: Image points of each pose.
             generator: Source of randomness.
+            region: The part of the object that is judged; None: the whole. Points are then drawn
+                about the part, as wide in its radii as else in the object's, and the surface is
+                the part's. What the network is given of a point stays the same.
 
         Returns:
             Log-likelihoods (B, N).
@@ -244,7 +256,7 @@ class PoseLikelihood(nn.Module):
             noise = draw_quasi_random(len(poses), pixels, generator, poses.device)
         else:
             noise = torch.randn(len(poses), 1, pixels, 2, generator=generator, device=poses.device)
-        if applies(poses.device) and sigma.numel() == 1:
+        if applies(poses.device) and sigma.numel() == 1 and region is None:
             kind = poses.device.type
             half = torch.is_autocast_enabled(kind)
             dtype = torch.get_autocast_dtype(kind) if half else poses.dtype
@@ -256,12 +268,21 @@ class PoseLikelihood(nn.Module):
                 return found + self.judge_surface(image, poses, sigma, center, radius)
         # half precision would round poses to half a millimeter
         with torch.autocast(poses.device.type, enabled=False):
-            points = sample_points(image, poses, center, radius, noise)
-            surface = self.judge_surface(image, poses, sigma, center, radius)
+            spread, anchor = SPREAD, None
+            if region is not None:
+                spread, anchor = SPREAD * region.radius / radius, region.center
+            points = sample_points(image, poses, center, radius, noise, spread, anchor)
+            surface = self.judge_surface(image, poses, sigma, center, radius, region)
         return self.score_sampled(points, poses, sigma, center, radius) + surface
 
     def judge_surface(
-        self, image: Pixels, poses: Tensor, sigma: Tensor, center: Tensor, radius: float
+        self,
+        image: Pixels,
+        poses: Tensor,
+        sigma: Tensor,
+        center: Tensor,
+        radius: float,
+        region: Region | None = None,
     ) -> Tensor | float:
         """Return the term of the hypotheses' surfaces, 0 without one; arguments as of `forward`.
 
@@ -270,7 +291,8 @@ class PoseLikelihood(nn.Module):
         if self.surface is None:
             return 0.0
         at = self.level(sigma.expand(len(poses)))
-        term: Tensor = self.surface(image, poses, sigma, at, center, radius)
+        middle, points = (center, None) if region is None else (region.center, region.surface)
+        term: Tensor = self.surface(image, poses, sigma, at, middle, radius, points)
         return term
 
     def score_sampled(

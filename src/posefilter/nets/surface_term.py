@@ -64,6 +64,7 @@ class SurfaceTerm(nn.Module):
         level: Tensor,
         center: Tensor,
         radius: float,
+        points: Tensor | None = None,
     ) -> Tensor:
         """Return the term.
 
@@ -72,26 +73,34 @@ class SurfaceTerm(nn.Module):
             poses: (B, N, 4, 4) camera_from_object [m].
             sigma: (B,) or () noise level [m].
             level: (B, 9) or (1, 9) the same, encoded.
-            center: (3,) the object's center [m].
+            center: (3,) the object's center [m], or that of the surface's part.
             radius: The object's radius [m].
+            points: (Q, 3) the surface points, of a part [m]; None: those of the object.
 
         Returns:
             (B, N).
         """
-        shares = self.measure(image, poses, sigma, center, radius)
+        shares = self.measure(image, poses, sigma, center, radius, points)
         at = level[:, None].expand(*shares.shape[:2], -1)
         x = torch.relu(self.enter(torch.cat([shares, at], dim=-1)))
         out: Tensor = self.leave(torch.relu(self.hidden(x)))[..., 0]
         return self.scale * out
 
     def measure(
-        self, image: "Pixels", poses: Tensor, sigma: Tensor, center: Tensor, radius: float
+        self,
+        image: "Pixels",
+        poses: Tensor,
+        sigma: Tensor,
+        center: Tensor,
+        radius: float,
+        points: Tensor | None = None,
     ) -> Tensor:
         """Return the network's inputs but the noise level; arguments as of `forward`.
 
         -> (B, N, 17).
         """
-        (H, W), (B, N), own = image.size, poses.shape[:2], self.get_buffer("points")
+        (H, W), (B, N) = image.size, poses.shape[:2]
+        own = self.get_buffer("points") if points is None else points
         R, t = rotation_of(poses), translation_of(poses)
         # one product for all poses: (B, N, 3, P)
         at = (R.flatten(0, 2) @ own.T).view(B, N, 3, -1) + t[..., None]
