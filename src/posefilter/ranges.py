@@ -234,6 +234,7 @@ RANGES: dict[str, Range] = {
     "max_width_px": _whole(16, MOST_SIDE),
     "encoder.spacings_m": Range(0, 1, above=True, many=True),
     "encoder.size": _whole(5, 64),
+    "encoder.trunk.stages": _whole(1, 4),
     "glimpse.size": _whole(1, 1024),
     "glimpse.spacing": Range(0, 1024, above=True),
     "likelihood.spread": POSITIVE,

@@ -1,12 +1,14 @@
 """Depth that no camera measures is unknown, or in another unit."""
 
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 import pytest
 from omegaconf import OmegaConf
 
+from posefilter.cli.job import Job
 from posefilter.cli.predict import read_inputs, read_photograph
 from posefilter.errors import UserError
 from posefilter.images import check_images, drop_unknown
@@ -62,11 +64,16 @@ def test_files_may_say_so_as_arrays_do(name: str, tmp_path: Path) -> None:
         read_photograph(str(color), str(tmp_path / "mm.npy"), 1000.0)
 
 
+def job_of(settings: dict[str, Any]) -> Job:
+    """Return the command of a photograph."""
+    return Job(OmegaConf.create(settings), {}, [], Path(), "predict", False)
+
+
 def test_a_distortion_that_no_lens_has_is_named(tmp_path: Path) -> None:
     np.save(tmp_path / "depth.npy", np.full((40, 60), 0.8))
     assert cv2.imwrite(str(tmp_path / "a.png"), RGB)
     files = {"rgb": str(tmp_path / "a.png"), "depth": str(tmp_path / "depth.npy")}
     given = {**files, "depth_scale": 1000, "intrinsics": "60,60,30,20"}
-    read_inputs(OmegaConf.create({**given, "distortion": "0.1,0,0,0"}))
+    read_inputs(job_of({**given, "distortion": "0.1,0,0,0"}))
     with pytest.raises(UserError, match=r"^distortion=1e\+09,0,0,0: without it, .* % of the depth"):
-        read_inputs(OmegaConf.create({**given, "distortion": "1e9,0,0,0"}))
+        read_inputs(job_of({**given, "distortion": "1e9,0,0,0"}))

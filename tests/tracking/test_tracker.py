@@ -12,7 +12,12 @@ from tests.tracking.toy import DEPTH, RGB, SPACE, K, make_toy, walk_pose
 import posefilter
 from posefilter.confidence.apparent_size import ApparentSize
 from posefilter.confidence.belief_scale import BeliefScale
-from posefilter.confidence.calibration import Calibration, Logistic, tabulate_errors
+from posefilter.confidence.calibration import (
+    Assessment,
+    Calibration,
+    Logistic,
+    tabulate_errors,
+)
 from posefilter.confidence.conformal import Conformal
 from posefilter.errors import UserError
 from posefilter.estimator import Estimator
@@ -192,6 +197,39 @@ def test_what_resembles_a_covered_object_elsewhere_must_show_more(
     assert ("recovered" in statuses) == found
     # in a second or two it may have been moved
     assert found or "recovered" in [tracker.update(RGB, depth, K).status for _ in range(60)]
+
+
+@pytest.mark.parametrize("penalty", [5.0, 1000.0])
+def test_an_object_that_was_never_tracked_was_not_lost_behind_something(
+    penalty: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """And what is found of one that was is as doubtful in the result as for the track."""
+    toy, estimator = make_toy()
+    toy.calibration = Calibration(
+        ("score",), (-5.0,), (2.0,), Logistic((3.0,), 0.0), Logistic((3.0,), 0.0),
+        {"right": 20, "wrong": 0, "absent": 20}, "toy", {},
+    )  # fmt: skip
+
+    def assess(*_: object) -> tuple[float, Assessment]:
+        presence = 0.0 if toy.truth is None else 0.99 if toy.truth is start else 0.9
+        return presence, Assessment(*(torch.tensor([presence]).double() for _ in range(2)))
+
+    monkeypatch.setattr("posefilter.tracking.track.measure_presence", assess)
+    tracker = posefilter.Tracker(estimator, TrackerSettings(elsewhere_penalty=penalty))
+    start = walk_pose(1)[0]
+    other = SPACE.move(start, torch.tensor([0.3, 0, 0, 0, 0, 0]))
+    for toy.truth in (None, None, None):
+        assert tracker.update(RGB, DEPTH, K).status == "lost"
+    toy.truth = other
+    assert "started" in [tracker.update(RGB, DEPTH, K).status for _ in range(3)]
+    for toy.truth in (start, start, start, None, None, None):
+        result = tracker.update(RGB, DEPTH, K)
+    assert result.status == "lost"
+    toy.truth = other
+    results = [tracker.update(RGB, DEPTH, K) for _ in range(3)]
+    assert {one.status for one in results} == {"lost"}
+    assert all(one.presence is not None and one.presence < 0.5 for one in results)
+    assert all(one.verdict != "found" for one in results)
 
 
 def test_a_loss_is_noticed_where_the_network_takes_other_pixels_for_the_object() -> None:

@@ -63,8 +63,9 @@ class TrackResult(Result):
         particles: How many particles the next frame starts from.
 
     The belief is calibrated by what errors of single images taught, where the frame was measured.
-    `presence` and `probability` are those of an estimate on a single image with the same features;
-    a track is judged lost or recovered by the presence.
+    `presence` and `probability` are those of an estimate on a single image with the same features,
+    lowered where a lost object would be elsewhere than where something covered it; a track is
+    judged lost or recovered by the presence.
     """
 
     status: str
@@ -216,13 +217,12 @@ class Track:
             sight = self._search(batch, predicted)
         else:
             sight = self._follow(batch, predicted, windowed=window is not None)
-        presence = sight.presence
-        if predicted is not None:
-            if lost and sight.belief is not None:
-                presence = self._doubt_elsewhere(presence, sight.belief, predicted)
-            if lost or presence < self.settings.lost_below:
-                predicted = self._look_behind(predicted, batch)
-        trusted, status = self.loss_detector.judge(presence)
+        if predicted is not None and self.loss_detector.ever_tracked:
+            if lost:
+                sight = self._doubt_elsewhere(sight, predicted)
+            if lost or sight.presence < self.settings.lost_below:
+                predicted = self._look_behind(predicted, sight)
+        trusted, status = self.loss_detector.judge(sight.presence)
         self.apparent_size = self.apparent_size if sight.size is None else sight.size
         if sight.found is not None and sight.found.features is not None:
             self.rotation_margin = sight.found.features.get("rotation_margin")
@@ -308,7 +308,7 @@ class Track:
         found, trace = self._filter(batch, encoding, start, search, refine, with_margin=True)
         return found._replace(size=self.method.measure_apparent_size(trace, batch))
 
-    def _look_behind(self, predicted: State, batch: Batch) -> State:
+    def _look_behind(self, predicted: State, sight: FrameEstimate) -> State:
         """Return the state of an object that is not seen, with how it was lost from sight.
 
         That is not measured again: a camera that moves sees another place where the object was
@@ -317,26 +317,35 @@ class Track:
         if predicted.loss is not None:
             loss = predicted.loss._replace(frames=predicted.loss.frames + 1)
             return predicted._replace(loss=loss)
-        hidden = measure_hidden(predicted.best, batch, self.method.object_model)
+        if sight.belief is None:  # the frame shows nothing
+            return predicted
+        hidden = measure_hidden(predicted.best, sight.batch, self.method.object_model)
         speed = predicted.velocity[0, :3].norm()
         return predicted._replace(loss=Loss(float(hidden), float(speed)))
 
-    def _doubt_elsewhere(self, presence: float, belief: BeliefBatch, predicted: State) -> float:
-        """Return how probable it is that a lost object is where the estimate puts it.
+    def _doubt_elsewhere(self, sight: FrameEstimate, predicted: State) -> FrameEstimate:
+        """Return what a frame shows of a lost object, less probable where it is elsewhere.
 
         An object that was lost behind something is probably still there, or not farther than it
         has moved since, and what resembles it elsewhere another.
         """
         loss, model = predicted.loss, self.method.object_model
-        if loss is None or not 0 < presence < 1:
-            return presence
+        if loss is None or sight.belief is None or not 0 < sight.presence < 1:
+            return sight
         found, last = (
-            origin_of(pose, model.center.to(pose)) for pose in (belief.best, predicted.best)
+            origin_of(pose, model.center.to(pose)) for pose in (sight.belief.best, predicted.best)
         )
         if float((found - last).norm()) < model.diameter + loss.frames * loss.speed:
-            return presence
+            return sight
         against = self.settings.elsewhere_penalty * loss.hidden * _FADES**loss.frames
-        return 1 / (1 + math.exp(against) * (1 - presence) / presence)
+        log_odds = math.log(sight.presence) - math.log1p(-sight.presence) - against
+        presence = 1 / (1 + math.exp(min(-log_odds, 700.0)))
+        judged = sight.found
+        if judged is not None:
+            probability = judged.probability * (presence / sight.presence)
+            same = torch.full_like(judged.presence, presence)
+            judged = judged._replace(presence=same, probability=probability)
+        return sight._replace(presence=presence, found=judged)
 
     def _filter(
         self,
