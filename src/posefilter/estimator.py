@@ -7,6 +7,7 @@ from dataclasses import replace
 from numbers import Integral
 from typing import Any
 
+import numpy as np
 import torch
 from omegaconf import OmegaConf
 
@@ -161,7 +162,9 @@ class Estimator:
             one = Images(*(part[i : i + 1] for part in images))
             if blank[i]:  # what cannot be judged is not searched for more, and is told as such
                 runs = self.run(one, seed)
-                out.extend(collect_results(runs, self.costs, self.pose_tolerance))
+                (results,) = collect_results(runs, self.costs, self.pose_tolerance)
+                nothing = np.zeros(size, bool)
+                out.append([replace(one, mask=nothing, conformal=None) for one in results])
                 continue
             batches = [
                 Batch(*(x.to(method.device) for x in make_batch(one, *own)))

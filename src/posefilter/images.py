@@ -209,6 +209,8 @@ def drop_unknown(depth: np.ndarray) -> np.ndarray:
 
     Where nearly all of it is so far it stays: it is in another unit then.
     """
+    if depth.ndim > 2 and len(depth) > 1:  # each image is judged by itself
+        return np.stack([drop_unknown(one) for one in depth])
     near = (depth > 0) & (depth < BEYOND)
     if np.count_nonzero(near) < _FEWEST * depth.size:  # else a share of those with depth, too
         known = np.isfinite(depth) & (depth > 0)

@@ -75,7 +75,7 @@ def read_text(path: Path, max_bytes: int = MOST_BYTES) -> str:
         BadData: The file is missing, larger, may not be read, or is not UTF-8.
     """
     try:
-        return read_bytes(path, max_bytes).decode()
+        return read_bytes(path, max_bytes).decode("utf-8-sig")  # editors of Windows mark it
     except UnicodeDecodeError as error:
         raise BadData(path, "not a text in UTF-8", str(error)) from error
 

@@ -107,7 +107,7 @@ def expand_weights(weights: str | Path | Sequence[str | Path]) -> list[str | Pat
     elif str(weights) == ALL:
         found = [*list_shipped().values()]
     else:
-        path = Path(weights)
+        path = Path(os.path.expanduser(weights))  # noqa: PTH111  # which raises nothing
         found = [*sorted(Path(path.anchor).glob(str(path.relative_to(path.anchor))))]
         found += [file for name, file in list_shipped().items() if fnmatch(name, str(weights))]
     if not found:

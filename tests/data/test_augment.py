@@ -211,3 +211,16 @@ def test_color_keeps_the_geometry_and_the_same_seed_the_same_image() -> None:
     np.testing.assert_array_equal(a.rgb, b.rgb)
     assert not np.array_equal(a.rgb, c.rgb)
     np.testing.assert_array_equal(a.depth, sample().depth)
+
+
+@pytest.mark.parametrize("origin", [-2.0, 0.0, 7.0])
+def test_an_occluder_is_before_the_object_wherever_its_meshs_origin_is(origin: float) -> None:
+    """`origin` [m]: how far along the object's z axis the mesh's origin was moved."""
+    own = sample()
+    moved = np.eye(4)
+    moved[2, 3] = origin
+    shifted = dataclasses.replace(own, camera_from_object=own.camera_from_object @ moved)
+    for seed in range(10):
+        here, there = (apply(PasteOccluder(1.0), seed, one) for one in (own, shifted))
+        np.testing.assert_array_equal(here.depth, there.depth)
+        assert (there.depth >= 0).all()

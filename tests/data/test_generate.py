@@ -336,7 +336,8 @@ def test_a_dataset_is_not_gone_on_with_once_its_mesh_has_changed(tmp_path: Path)
     with pytest.raises(UserError, match="another mesh of box0, whose file was changed since"):
         generate(out, 3, **how)
     assert (out / "_generator.json").read_bytes() == record
-    assert generate(out, 2, **how).rendered == 0  # nothing is left to render
+    with pytest.raises(UserError, match="another mesh of box0"):  # also with nothing left to render
+        generate(out, 2, **how)
     assert (out / "_generator.json").read_bytes() == record
     (meshes / "box0.ply").write_bytes(before)
     assert generate(out, 3, **how).rendered == 1

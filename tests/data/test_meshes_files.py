@@ -388,3 +388,24 @@ def test_a_picture_without_texture_coordinates_is_refused(tmp_path: Path) -> Non
         read_mesh(tmp_path / "a.glb", "a")
     _export_glb(tmp_path / "plain.glb", np.full((8, 8), 90, dtype=np.uint8), uv=False)
     assert read_mesh(tmp_path / "plain.glb", "plain").texture.mean() == pytest.approx(90, abs=1)
+
+
+def test_a_comment_that_ends_with_a_backslash_is_one_line(pyramid: Path) -> None:
+    """As of a folder of Windows; a line that goes on is one, too."""
+    plain = read_mesh(pyramid, "a")
+    text = "# made of C:\\cad\\\n" + OBJ.replace("v 0 0.1 0\n", "v 0 \\\n0.1 0\n")
+    pyramid.write_text(text)
+    after = read_mesh(pyramid, "a")
+    np.testing.assert_array_equal(after.vertices, plain.vertices)
+    np.testing.assert_array_equal(after.texture, plain.texture)
+
+
+def test_a_plys_texture_may_have_any_name(tmp_path: Path) -> None:
+    picture = _picture(tmp_path / "Tür.png")
+    header = "ply\nformat ascii 1.0\ncomment TextureFile Tür.png\nelement vertex 3\n"
+    header += "property float x\nproperty float y\nproperty float z\n"
+    header += "property float texture_u\nproperty float texture_v\nelement face 1\n"
+    header += "property list uchar int vertex_indices\nend_header\n"
+    rows = "0 0 0 0 0\n0.1 0 0 1 0\n0 0.1 0 0 1\n3 0 1 2\n"
+    (tmp_path / "a.ply").write_text(header + rows, encoding="utf-8")
+    np.testing.assert_array_equal(read_mesh(tmp_path / "a.ply", "a").texture, picture)

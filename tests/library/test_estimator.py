@@ -225,6 +225,9 @@ def test_an_image_of_one_color_or_depth_is_doubted(estimator: posefilter.Estimat
         assert cause in result.blank == result.warnings[0]
     (found,) = estimator.predict(0 * rgb, depth, K, instances=1)
     assert found.verdict == "unsure"
+    assert found.mask.shape == depth.shape
+    assert not found.mask.any()
+    assert found.conformal is None
     ((covered,), seen) = estimator.predict(
         images[1:], np.stack([depth[::-1], depth]), K, instances=2
     )

@@ -86,6 +86,7 @@ def test_a_path_may_begin_at_the_home_folder(
     monkeypatch.setenv("HOME", str(tmp_path))
     (tmp_path / "own.ckpt").write_bytes(b"")
     assert find_weights("~/own.ckpt") == tmp_path / "own.ckpt"
+    assert expand_weights("~/*.ckpt") == [tmp_path / "own.ckpt"]
     with pytest.raises(UserError, match="~nobody_of_that_name"):
         find_weights("~nobody_of_that_name/own.ckpt")
 

@@ -70,6 +70,9 @@ _OWN = {
 _HOPED, _SLOWEST = 0.75, 0.4
 
 
+_RENDERED = "data.generate."  # settings of a training that are those of its renders
+
+
 class Stage(NamedTuple):
     """A part of the work."""
 
@@ -126,11 +129,10 @@ class Onboarding:
         file = self.out / "meshes" / self.mesh.name / "symmetries.json"
         own = str(self.cfg.symmetries)
         own = "found" if own == "auto" else own  # as records of earlier versions have it
-        if Path(own).is_file():
-            own = Path(own).read_text(encoding="utf-8")
+        content = Path(own).read_bytes() if Path(own).is_file() else own.encode()
         return {
             "mesh": self.mesh_digest,
-            "symmetries": sha256(own.encode()).hexdigest()[:16],
+            "symmetries": sha256(content).hexdigest()[:16],
             "used": sha256(file.read_bytes()).hexdigest()[:16] if file.is_file() else "",
         }
 
@@ -138,10 +140,14 @@ class Onboarding:
         """Return all that decides a stage's result."""
         known = {**self.digests, "frames": self.frames, "name": self.mesh.name}
         known["train_overrides"] = unresolved(self.cfg.get("train_overrides"))
-        return {
+        found = {
             key: known[key] if key in known else resolve(self.cfg.get(key))
             for key in stage.settings
         }
+        rendered = [one for one in self.cfg.get("train_overrides") or () if _RENDERED in str(one)]
+        if rendered and stage.name == "render":  # else as records of earlier versions have it
+            found["train_overrides"] = sorted(map(str, rendered))
+        return found
 
     def job(self, folder: Path, *more: str, frames: int | None = None) -> Job:
         """Return the training, as one of a sweep: begun before, it is resumed.

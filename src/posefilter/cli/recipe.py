@@ -8,6 +8,7 @@ its numbers are such as methods have.
 
 import math
 import re
+import unicodedata
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -149,7 +150,10 @@ def _check_value(path: str, value: Any) -> None:
         if wrong:
             raise UserError(f"its recipe has the key {str(wrong[0])[:40]!r}")
     elif isinstance(value, str):
-        if len(value) > _LONGEST or not value.isprintable():
+        # blanks of other scripts are no signs that a terminal obeys
+        if len(value) > _LONGEST or not all(
+            one.isprintable() or unicodedata.category(one) == "Zs" for one in value
+        ):
             raise UserError(f"its recipe's {where} is no plain text of at most {_LONGEST} letters")
         # a select stands alone: within a text, nobody would see what it refers to
         if "${" in _REFERENCE.sub("", value) and not _SELECT.fullmatch(value):

@@ -241,7 +241,8 @@ def open_videos(cfg: DictConfig, objects: Sequence[str]) -> tuple[Sequence[Video
     if cfg.frames:
         camera = read_intrinsics(cfg.intrinsics, cfg.distortion is not None)
         scale = float(cfg.depth_scale or _DEPTH_SCALE)
-        if cfg.depth_scale is None:
+        units = (Path(str(cfg.frames)) / "depth").glob("*.png")  # others may be in meters
+        if cfg.depth_scale is None and any(units):
             check_depth_scale(camera, scale, f"intrinsics={cfg.intrinsics}")
         lens = None if cfg.distortion is None else parse_distortion(cfg.distortion)
         folder = Path(str(cfg.frames))

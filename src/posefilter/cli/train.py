@@ -81,6 +81,12 @@ def build(job: Job) -> Run:
     method, trainer = build_method(recipe(job)), build_trainer(job)
     data = build_data(job.cfg.data, job.cfg.console, job.overrides)
     data.setup("fit")
+    if len(data.objects) > 1:
+        names = ", ".join(data.objects)
+        raise UserError(
+            f"data.object: a method learns one object, and the data have {names}; name one, or "
+            "sweep over several, -m data.object=A,B"
+        )
     object_model = data.object_to_learn()
     method.set_object(object_model)
     if job.cfg.warm_start and find_begun(job) is None:  # else its own checkpoint has them

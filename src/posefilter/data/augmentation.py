@@ -194,12 +194,17 @@ class PasteOccluder:
         mask[cut] &= ~patch
         if mask.sum() < self.keep * sample.mask.sum():
             return sample
-        distance = sample.camera_from_object[2, 3] * rng.uniform(0.72, 0.94)
+        # of what is seen of the object: the origin of its mesh may be anywhere
+        seen = sample.depth[sample.mask & (sample.depth > 0)]
+        distance = float(np.median(seen)) if seen.size else float(sample.camera_from_object[2, 3])
+        if distance <= 0:
+            return sample
+        distance *= rng.uniform(0.72, 0.94)
         surface = distance * (1 - 0.05 * (1 - a * a) + 0.03 * b * rng.normal())
         behind = sample.depth[cut][patch]
         known = behind[behind > 0]
-        if known.size and distance > 0:
-            # a deep object reaches further to the camera than its origin
+        if known.size:
+            # a deep object reaches further to the camera than most of what is seen of it
             surface *= min(1.0, 0.98 * known.min() / surface[patch].max())
         drawn = draw(rng).rgb
         if drawn.shape != sample.rgb.shape:  # images of several sizes

@@ -222,7 +222,7 @@ def _listed(records: Sequence[FrameRecord], file: str, root: Path) -> list[int]:
     if not chosen:
         raise UserError(
             f"{path}: none of the frames that it lists is in {root} with the object asked for "
-            "(data.object=null takes all objects)"
+            "(of an evaluation data.object=null takes all objects)"
         )
     missing = sorted(listed - there - seen)
     if missing and seen & there:  # elsewhere scenes are no folders, or are numbered otherwise

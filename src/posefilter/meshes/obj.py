@@ -1,5 +1,6 @@
 """Read Wavefront OBJ and its materials, with seams in the texture and normals of each corner."""
 
+import re
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -160,6 +161,7 @@ def read_obj(path: Path) -> RawMesh:
 
 
 # of a map: how many words follow an option
+_COMMENT = re.compile(r"^[ \t]*#.*$", re.MULTILINE)  # a backslash at its end joins nothing
 _OPTIONS = {
     "-blendu": 1, "-blendv": 1, "-boost": 1, "-bm": 1, "-cc": 1, "-clamp": 1, "-imfchan": 1,
     "-mm": 2, "-texres": 1, "-type": 1,
@@ -215,7 +217,7 @@ def _split(index: np.ndarray, vertices: np.ndarray, firsts: np.ndarray, count: i
 def _read_lines(path: Path) -> Iterator[tuple[str, str]]:
     """Yield keyword and rest of each line; a line that ends with a backslash goes on."""
     text = read_bytes(path).decode("utf-8-sig", errors="replace")
-    text = text.replace("\r\n", "\n").replace("\\\n", " ")
+    text = _COMMENT.sub("", text.replace("\r\n", "\n")).replace("\\\n", " ")
     for line in text.splitlines():
         key, *rest = line.split(None, 1) or [""]
         if key.lower() in ("v", "vt", "vn", "f"):

@@ -17,6 +17,14 @@ _SHORT = {"r": "red", "g": "green", "b": "blue"}
 _COORDINATES = ("texture_u", "texture_v", "u", "v", "s", "t", "texcoord")
 
 
+def _decode(name: str) -> str:
+    """Return a file's name that was read as Latin-1, in UTF-8 where it is that."""
+    try:
+        return name.encode("latin-1").decode("utf-8")
+    except UnicodeDecodeError:
+        return name
+
+
 def open_ply(path: Path) -> tuple[io.BytesIO, list[str]]:
     """Open a PLY file for trimesh, which looks for colors under one name alone, and not at all
     where there are texture coordinates, and takes a binary file's faces to be all of one size.
@@ -39,7 +47,7 @@ def open_ply(path: Path) -> tuple[io.BytesIO, list[str]]:
         return io.BytesIO(data), []
     header = data[:end].decode("latin-1")
     lines = map(_TEXTURE.fullmatch, map(str.strip, header.splitlines()))
-    textures = list(dict.fromkeys(found[1].strip() for found in lines if found))
+    textures = list(dict.fromkeys(_decode(found[1].strip()) for found in lines if found))
     if len(textures) > 1:
         raise UserError(
             f"{path}: names {len(textures)} textures ({', '.join(textures[:4])}), of which a PLY "

@@ -15,6 +15,7 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import cv2
 import numpy as np
 
 from posefilter.errors import BadData, UserError
@@ -60,12 +61,16 @@ _RENAMED = {
 }
 
 
+_SAME_COLOR = 6  # by how much decoders of one texture may differ, of 255
+
+
 class _Record(NamedTuple):
     """How a dataset was begun."""
 
     settings: dict[str, Any]
     frames: int
     mesh: str | None  # digest of the object's mesh
+    colors: list[int] | None = None  # see `summarize_print`; None: not recorded
 
 
 @dataclass(frozen=True)
@@ -167,7 +172,8 @@ def generate(
     try:
         if held:  # another process may have rendered meanwhile
             todo = [i for i in todo if not all(path.is_file() for path in job.files(out, i))]
-        _open_dataset(out, job, frames, digest_mesh(store.load(object)) if todo else None)
+        known = todo or object in store.names()
+        _open_dataset(out, job, frames, store.load(object) if known else None)
         if todo:
             log.info("rendering %d frames of %s into %s", len(todo), object, out)
         began = time.perf_counter()
@@ -215,9 +221,29 @@ def shows_another_mesh(out: Path, store: MeshStore, name: str) -> bool:
         UserError: Its record, or the mesh, is damaged.
     """
     record = _read_record(out)
-    if record is None or record.mesh is None or record.settings.get("object") != name:
+    name = split_part(name)[0] if store.is_part(name) else name  # scenes are of whole objects
+    if record is None or record.settings.get("object") != name:
         return False
-    return digest_mesh(store.load(name)) != record.mesh
+    return _is_another(store.load(name), record)
+
+
+def _is_another(mesh: Mesh, record: _Record) -> bool:
+    """Tell whether a mesh is another than a dataset's record has."""
+    if record.mesh not in (None, digest_mesh(mesh)):
+        return True
+    if record.colors is None:
+        return False
+    now = summarize_print(mesh)
+    pairs = zip(now, record.colors, strict=False)
+    return len(now) != len(record.colors) or any(abs(a - b) > _SAME_COLOR for a, b in pairs)
+
+
+def summarize_print(mesh: Mesh) -> list[int]:
+    """Return the mean colors of a texture's parts, 8 x 8 of them, in 0 to 255: another print of the
+    same size shows in them, and another decoder of JPEGs does not.
+    """
+    few = cv2.resize(mesh.texture, (8, 8), interpolation=cv2.INTER_AREA)
+    return [int(value) for value in few.ravel()]
 
 
 def _make_job(given: Mapping[str, Any]) -> Job:
@@ -357,17 +383,19 @@ def digest_mesh(mesh: Mesh) -> str:
     return digest.hexdigest()
 
 
-def _open_dataset(out: Path, job: Job, frames: int, mesh: str | None) -> None:
+def _open_dataset(out: Path, job: Job, frames: int, mesh: Mesh | None) -> None:
     """Write the settings into a new dataset, or check that an existing one has the same.
 
     Args:
         out: The dataset's folder.
         job: What to render.
         frames: How many frames it is to hold.
-        mesh: Digest of the object's mesh; None where nothing is left to render.
+        mesh: The object's mesh; None where it is not there, and nothing is left to render.
     """
     settings = _describe(job)
     path, record = out / GENERATOR, _read_record(out)
+    digest = None if mesh is None else digest_mesh(mesh)
+    colors = None if mesh is None else summarize_print(mesh)
     if record is not None:
         differing = _list_differing(record.settings, settings)
         if not any(out.glob("mixed/*/[0-9]*.json")):
@@ -379,13 +407,16 @@ def _open_dataset(out: Path, job: Job, frames: int, mesh: str | None) -> None:
             raise UserError(
                 f"{path}: this dataset was begun with other settings ({keys}); choose another out="
             )
-        elif mesh and record.mesh not in (None, mesh):
+        elif mesh and _is_another(mesh, record):
             raise UserError(
                 f"{path}: this dataset was begun with another mesh of {job.object}, whose file was "
                 "changed since; choose another out="
             )
         else:
-            frames, mesh = max(frames, len(_list_rendered(out))), mesh or record.mesh
+            frames = max(frames, len(_list_rendered(out)))
+            digest = digest or record.mesh
+            # of what earlier versions rendered, and of what is complete, the print is not known
+            colors = record.colors
         remove_parts(out, [".", "mixed/*"])
     elif out.is_dir() and any(path.name != LOCK for path in out.iterdir()):
         raise UserError(
@@ -395,7 +426,8 @@ def _open_dataset(out: Path, job: Job, frames: int, mesh: str | None) -> None:
     out.mkdir(parents=True, exist_ok=True)
     packages = ("posefilter", "numpy", "embreex", "opencv-python-headless")
     versions = {name: _find_version(name) for name in packages}
-    content = {"settings": settings, "frames": frames, "mesh": mesh, "versions": versions}
+    content = {"settings": settings, "frames": frames, "mesh": digest, "colors": colors}
+    content["versions"] = versions
     fat.write_json(path, content)
 
 
@@ -417,7 +449,9 @@ def _read_record(out: Path) -> _Record | None:
     try:
         content = read_json(path)
         settings, frames = _with_defaults(content["settings"]), int(content["frames"])
-        return _Record(settings, frames, content.get("mesh"))
+        colors = content.get("colors")
+        colors = None if colors is None else [int(value) for value in colors]
+        return _Record(settings, frames, content.get("mesh"), colors)
     except (BadData, ValueError, KeyError, TypeError, AttributeError, OverflowError) as error:
         raise UserError(
             f"{path}: not a generator's record any more ({error}); choose another out="

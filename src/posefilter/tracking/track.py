@@ -13,7 +13,7 @@ from posefilter.confidence.apparent_size import ApparentSize
 from posefilter.confidence.calibration import Assessment
 from posefilter.confidence.features import measure_hidden
 from posefilter.confidence.tolerance import PoseTolerance
-from posefilter.confidence.verdicts import Costs
+from posefilter.confidence.verdicts import Costs, Verdict
 from posefilter.data.resize import network_size
 from posefilter.filters.icp import PointToPlaneIcp
 from posefilter.filters.loop import ParticleFilter, inherit, make_particles
@@ -77,6 +77,22 @@ class TrackResult(Result):
         """Whether the pose is one to go by: the object is not lost."""
         return self.status != LOST
 
+    def decide(
+        self, costs: Costs, pose_tolerance: PoseTolerance | None = None, prior: float = 0.5
+    ) -> Verdict | None:
+        """Return the verdict as of `Result`; an object that is lost is not found, since its pose is
+        no more than a guess.
+        """
+        verdict = super().decide(costs, pose_tolerance, prior)
+        return verdict if self.is_tracked or verdict != "found" else "unsure"
+
+    def probability_within(self, pose_tolerance: PoseTolerance | None) -> float:
+        """Return the probability as of `Result`, at most the presence, which may have been lowered
+        since.
+        """
+        within = super().probability_within(pose_tolerance)
+        return within if self.presence is None else min(within, self.presence)
+
     @property
     def _why_no_sets(self) -> str:
         return "their guarantee is of one search of the whole image, not of a track"
@@ -85,7 +101,8 @@ class TrackResult(Result):
 class Loss(NamedTuple):
     """How an object was lost from sight."""
 
-    hidden: float  # the share of its surface before which something nearer was measured
+    # the share of its surface before which something nearer was measured; None before a frame told
+    hidden: float | None
     speed: float  # of its center in the last frame that showed it [m]
     frames: int = 0  # since then
 
@@ -314,14 +331,12 @@ class Track:
         That is not measured again: a camera that moves sees another place where the object was
         last.
         """
-        if predicted.loss is not None:
-            loss = predicted.loss._replace(frames=predicted.loss.frames + 1)
-            return predicted._replace(loss=loss)
-        if sight.belief is None:  # the frame shows nothing
-            return predicted
-        hidden = measure_hidden(predicted.best, sight.batch, self.method.object_model)
-        speed = predicted.velocity[0, :3].norm()
-        return predicted._replace(loss=Loss(float(hidden), float(speed)))
+        loss = predicted.loss or Loss(None, float(predicted.velocity[0, :3].norm()), -1)
+        loss = loss._replace(frames=loss.frames + 1)
+        if loss.hidden is None and sight.belief is not None:
+            hidden = measure_hidden(predicted.best, sight.batch, self.method.object_model)
+            loss = loss._replace(hidden=float(hidden))
+        return predicted._replace(loss=loss)
 
     def _doubt_elsewhere(self, sight: FrameEstimate, predicted: State) -> FrameEstimate:
         """Return what a frame shows of a lost object, less probable where it is elsewhere.
@@ -330,7 +345,9 @@ class Track:
         has moved since, and what resembles it elsewhere another.
         """
         loss, model = predicted.loss, self.method.object_model
-        if loss is None or sight.belief is None or not 0 < sight.presence < 1:
+        if loss is None or loss.hidden is None or sight.belief is None:
+            return sight
+        if not 0 < sight.presence < 1:  # no odds move a certainty
             return sight
         found, last = (
             origin_of(pose, model.center.to(pose)) for pose in (sight.belief.best, predicted.best)

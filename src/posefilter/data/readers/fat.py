@@ -105,7 +105,10 @@ class FatReader(BaseReader):
         settings = [(folder, self._settings(folder)) for folder in folders]
         known = sorted({name for _, one in settings if one for name in one[0]})
         self.objects = choose_objects(
-            objects, known, self.root, strip=lambda name: name.removesuffix("_16k")
+            objects,
+            known,
+            self.root,
+            strip=lambda name: name if name in known else name.removesuffix("_16k"),
         )
         self._entries: list[_Entry] = []
         numbers_of_scenes = number_scenes(self.root, folders)

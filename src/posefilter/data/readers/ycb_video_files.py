@@ -39,6 +39,7 @@ def read_class_names(root: Path) -> tuple[str, ...]:
     for path in (
         root / "image_sets" / "classes.txt",
         root / "classes.txt",
+        root.parent / "image_sets" / "classes.txt",  # of root=X/data
         root.parent / "classes.txt",
     ):
         if path.is_file():
