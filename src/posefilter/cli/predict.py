@@ -164,7 +164,8 @@ def predict_several(job: Job) -> list[Result]:
     missing = [name for name in absent if name not in {one.object for one in results}]
     answers += [describe_absent(one, scores[one], costs, own[one], job) for one in missing]
     write_json(folder / "poses.json", answers)
-    seconds = sum(one.seconds for one in results)  # of those that are absent, too
+    # with instances= that of classes without a result is not known
+    seconds = sum(one.seconds for one in results)
     write_poses_csv(folder / "poses.csv", list_rows(seen, estimator.objects, seconds))
     files = {"poses": folder / "poses.json", "poses.csv": folder / "poses.csv"}
     files |= {"overlay": folder / "overlay.png", "beliefs": beliefs}
