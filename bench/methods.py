@@ -40,9 +40,6 @@ UNBOUNDED = (
     "s1_glimpse,s3_balanced,s4_displacement_loss,s5_position,s6_informed,s7_context,s8_resample,"
     "s9_displacement_loss_and_position,c1_normalization,c2_glimpse"
 )
-UNBOUNDED_BOX = (
-    "s1_glimpse,s4_displacement_loss,s7_context,box_s10_steps,c1_normalization,c2_glimpse"
-)
 SHIPPED = "weights/003_cracker_box.ckpt"  # of pose_pf
 MEMORISED = "memorize/experiment=memorize,model={},seed=0,variant=working"
 HELD_OUT = "held_out/model={},seed=0"
@@ -282,37 +279,26 @@ def list_units_at_full_size() -> list[Line]:
 
 
 def list_units_of_ablations() -> list[Line]:
-    """Return the ablations whose displacement has a unit, for 1 and 10 pixels besides half a frame;
-    and bounds apart from the unit, whose step is also that of the unbounded one at 10 pixels.
+    """Return patch_pf's ablations whose displacement has a unit, for 1 and 10 pixels besides half a
+    frame; and bounds of the detectors apart from the unit, one of them the step of the unbounded
+    one at 10 pixels.
     """
     seeds = "seed=0,1,2"
     others = ",".join(name for name in UNBOUNDED.split(",") if name not in TELLING.split(","))
-    lines = []
-    for model in WITH_POSE:
-        some = f"model={model} experiment=memorize sweep=ablation callbacks=checkpoints"
-        lines += [
-            Line(
-                "ablation_unit",
-                f"{some} ablation={UNBOUNDED} model.displacement.unit=1,10 {seeds}",
-                into=model,
-            ),
-            Line("ablation", f"{some} ablation={others} seed=1,2", into=f"{model}_more_seeds"),
-        ]
+    some = "model=patch_pf experiment=memorize sweep=ablation callbacks=checkpoints"
+    lines = [
+        Line("ablation_unit", f"{some} ablation={UNBOUNDED} model.displacement.unit=1,10 {seeds}"),
+        Line("ablation", f"{some} ablation={others} seed=1,2", into="patch_pf_more_seeds"),
+    ]
     for model in DETECTORS:
         bounded = SMALL_BOXES.format(model, "s2_bounded")
-        unbounded = SMALL_BOXES.format(model, UNBOUNDED_BOX)
-        lines += [
+        lines.append(
             Line(
                 "bounded_unit",
                 f"{bounded} model.displacement.max_displacement=0.5,0.25,0.03125 {seeds}",
                 into=model,
-            ),
-            Line(
-                "ablation_detect_unit",
-                f"{unbounded} model.displacement.unit=half_frame,1,10 {seeds}",
-                into=model,
-            ),
-        ]
+            )
+        )
     return lines
 
 
