@@ -20,6 +20,7 @@ from itertools import product
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import marked
 from marked import format_row, put_table
 from photographs import link_meshes
 from programs import HOME, make_parser, run_command
@@ -147,6 +148,16 @@ def _show(value: float | None, digits: int) -> str:
     return "–" if value is None else f"{value:.{digits}f}"
 
 
+def group_rows(lines: Sequence[str]) -> dict[str, list[str]]:
+    """Return a table's rows by tool; one whose first cell is empty belongs to the row above."""
+    out: dict[str, list[str]] = {}
+    tool = ""
+    for line in lines:
+        tool = line.split("|")[1].strip() or tool
+        out.setdefault(tool, []).append(line)
+    return out
+
+
 def read_rows(runs: Sequence[Run]) -> Iterator[str]:
     """Yield the rows of the runs that are done."""
     for run in runs:
@@ -194,7 +205,10 @@ def main() -> int:
         rows = [row for pair in pairs for row in tabulate_parts(*pair, options.seeds)]
         PAGE.write_text(put_table(PAGE.read_text(), "tools by parts", PARTS_HEAD, rows))
     elif not options.list:
-        rows = [row for tool in TOOLS for row in read_rows(runs[tool])]
+        before, rows = group_rows(marked.read_rows(PAGE.read_text(), "tools")), list[str]()
+        for tool in TOOLS:  # the rows of a tool whose runs are not all there stay
+            whole = all(is_done(run.folder) for run in runs[tool])
+            rows += list(read_rows(runs[tool])) if whole else before.get(tool, [])
         PAGE.write_text(put_table(PAGE.read_text(), "tools", HEAD, rows))
     return worst
 

@@ -52,3 +52,8 @@ def test_the_same_weights_are_tested_in_every_way(tools: ModuleType) -> None:
     by_parts = [set(tools.BY_PARTS) <= set(one) for one in commands]
     assert by_parts == [False] * 2 + [True] * 4
     assert str(run.folder).endswith("pose_pf_048_hammer_seed1")
+
+
+def test_rows_of_a_tool_stay_together(tools: ModuleType) -> None:
+    rows = ["| a | `x` | 1 |", "|  |  | 2 |", "| b | `x` | 3 |", "| a | `y` | 4 |"]
+    assert tools.group_rows(rows) == {"a": [rows[0], rows[1], rows[3]], "b": [rows[2]]}
