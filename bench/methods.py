@@ -252,16 +252,6 @@ def list_units() -> list[Line]:
         if model in DETECTORS:
             size = "sweep=ablation_detect filter.particles=8 model.net.width=16"
         lines.append(Line("unit", f"model={model} {paper} {size} {UNITS} seed=0,1,2"))
-    # bounded, in the unit of the unbounded one: which of both brings particles onto the object?
-    bounded = "experiment=memorize sweep=ablation_detect ablation=s2_bounded"
-    lines += [
-        Line(
-            "ablation_detect",
-            f"model={model} {bounded} model.displacement.max_displacement=0.5 seed=0,1,2",
-            into=f"{model}_bound",
-        )
-        for model in DETECTORS
-    ]
     return lines
 
 

@@ -144,9 +144,10 @@ class Onboarding:
             key: known[key] if key in known else resolve(self.cfg.get(key))
             for key in stage.settings
         }
-        rendered = [one for one in self.cfg.get("train_overrides") or () if _RENDERED in str(one)]
+        words = map(str, self.cfg.get("train_overrides") or ())
+        rendered = sorted(one for one in words if key_of(one).startswith(_RENDERED))
         if rendered and stage.name == "render":  # else as records of earlier versions have it
-            found["train_overrides"] = sorted(map(str, rendered))
+            found["train_overrides"] = rendered
         return found
 
     def job(self, folder: Path, *more: str, frames: int | None = None) -> Job:

@@ -349,7 +349,9 @@ def read_inputs(job: Job) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     cfg = job.cfg
     rgb, depth = read_photograph(cfg.rgb, cfg.depth, cfg.depth_scale)
     camera = read_intrinsics(cfg.intrinsics, cfg.distortion is not None)
-    if not holds_meters(Path(cfg.depth)) and "depth_scale" not in map(key_of, job.overrides):
+    by_default = "depth_scale" not in map(key_of, job.overrides)
+    # last, since it reads the file once more
+    if by_default and camera.depth_scale is not None and not holds_meters(Path(cfg.depth)):
         check_depth_scale(camera, cfg.depth_scale, f"intrinsics={cfg.intrinsics}")
     K = camera.K
     if camera.size is not None:
@@ -359,13 +361,13 @@ def read_inputs(job: Job) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return rgb, depth, K
 
 
-def check_depth_scale(camera: CameraFile, units: float, said: str) -> None:
+def check_depth_scale(camera: CameraFile, units: float, setting: str) -> None:
     """Raise UserError where the camera's file has another depth scale than the default.
 
     Args:
         camera: The camera.
         units: Units of the depth files in a meter, which nobody typed.
-        said: The setting that names the file.
+        setting: What names the file, as typed.
     """
     own = camera.depth_scale
     # of BOP millimeters a unit, of others units in a meter, or meters a unit
@@ -374,7 +376,7 @@ def check_depth_scale(camera: CameraFile, units: float, said: str) -> None:
     ):
         return
     raise UserError(
-        f"{said}: its depth_scale is {own:g}, which for BOP's files means depth_scale="
+        f"{setting}: its depth_scale is {own:g}, which for BOP's files means depth_scale="
         f"{1000 / own:g} here, and {units:g} is the default; type depth_scale="
     )
 

@@ -160,8 +160,8 @@ def read_obj(path: Path) -> RawMesh:
     )
 
 
-# of a map: how many words follow an option
 _COMMENT = re.compile(r"^[ \t]*#.*$", re.MULTILINE)  # a backslash at its end joins nothing
+# of a map: how many words follow an option
 _OPTIONS = {
     "-blendu": 1, "-blendv": 1, "-boost": 1, "-bm": 1, "-cc": 1, "-clamp": 1, "-imfchan": 1,
     "-mm": 2, "-texres": 1, "-type": 1,

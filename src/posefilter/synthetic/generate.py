@@ -224,18 +224,18 @@ def shows_another_mesh(out: Path, store: MeshStore, name: str) -> bool:
     name = split_part(name)[0] if store.is_part(name) else name  # scenes are of whole objects
     if record is None or record.settings.get("object") != name:
         return False
-    return _is_another(store.load(name), record)
+    mesh = store.load(name)
+    return _is_another(digest_mesh(mesh), summarize_print(mesh), record)
 
 
-def _is_another(mesh: Mesh, record: _Record) -> bool:
+def _is_another(digest: str, colors: list[int], record: _Record) -> bool:
     """Tell whether a mesh is another than a dataset's record has."""
-    if record.mesh not in (None, digest_mesh(mesh)):
+    if record.mesh not in (None, digest):
         return True
     if record.colors is None:
         return False
-    now = summarize_print(mesh)
-    pairs = zip(now, record.colors, strict=False)
-    return len(now) != len(record.colors) or any(abs(a - b) > _SAME_COLOR for a, b in pairs)
+    pairs = zip(colors, record.colors, strict=False)
+    return len(colors) != len(record.colors) or any(abs(a - b) > _SAME_COLOR for a, b in pairs)
 
 
 def summarize_print(mesh: Mesh) -> list[int]:
@@ -407,7 +407,7 @@ def _open_dataset(out: Path, job: Job, frames: int, mesh: Mesh | None) -> None:
             raise UserError(
                 f"{path}: this dataset was begun with other settings ({keys}); choose another out="
             )
-        elif mesh and _is_another(mesh, record):
+        elif digest and colors and _is_another(digest, colors, record):
             raise UserError(
                 f"{path}: this dataset was begun with another mesh of {job.object}, whose file was "
                 "changed since; choose another out="
@@ -415,8 +415,7 @@ def _open_dataset(out: Path, job: Job, frames: int, mesh: Mesh | None) -> None:
         else:
             frames = max(frames, len(_list_rendered(out)))
             digest = digest or record.mesh
-            # of what earlier versions rendered, and of what is complete, the print is not known
-            colors = record.colors
+            colors = record.colors  # of the print that is there; None of earlier versions
         remove_parts(out, [".", "mixed/*"])
     elif out.is_dir() and any(path.name != LOCK for path in out.iterdir()):
         raise UserError(
