@@ -416,6 +416,7 @@ def test_the_examples_import_neither_torch_nor_us(name: str) -> None:
     ("typed", "told"),
     [
         (["nothing", "c.png", "d.png", "1,1,1,1", "1"], "nothing: no folder that export.py"),
+        (["cut_short", "c.png", "d.png", "1,1,1,1", "1"], "cut_short: no folder that export.py"),
         (["pixels", "c.png", "d.png", "1,1,1,1", "1"], "pixels: its particles are pixels; pix"),
         (["poses", "c.png", "d.png", "1,1,1", "1"], "1,1,1 1: expected fx,fy,cx,cy"),
         (["poses", "c.png", "d.png", "1,1,1,1", "mm"], "1,1,1,1 mm: expected"),
@@ -433,6 +434,9 @@ def test_the_examples_mistakes_are_one_line(
     for name in ("poses", "pixels"):
         (tmp_path / name).mkdir()
         (tmp_path / name / "filter.json").write_text(json.dumps({"particles_are": name}))
+        (tmp_path / name / "encode.onnx").touch()
+    (tmp_path / "cut_short").mkdir()  # the settings without the networks
+    (tmp_path / "cut_short" / "filter.json").write_text(json.dumps({"particles_are": "poses"}))
     depth = np.full((6, 8), 700, np.uint16)
     for name, image in (("c", np.zeros((6, 8, 3), np.uint8)), ("d", depth), ("0", 0 * depth)):
         cv2.imwrite(str(tmp_path / f"{name}.png"), image)
