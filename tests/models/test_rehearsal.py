@@ -365,6 +365,11 @@ def test_a_checkpoint_without_its_recipe_is_refused_before_the_training() -> Non
             super().on_save_checkpoint(checkpoint)
             checkpoint["mine"] = object()
 
+    class Nests(Own):
+        def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+            super().on_save_checkpoint(checkpoint)
+            checkpoint["mine"] = tuple(range(200))  # torch reads it, and our commands do not
+
     class Keeps(Own):
         def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
             super().on_save_checkpoint(checkpoint)
@@ -375,4 +380,6 @@ def test_a_checkpoint_without_its_recipe_is_refused_before_the_training() -> Non
         rehearse(build(Forgets))
     with pytest.raises(UserError, match=r"Pickles\.on_save_checkpoint: checkpoint\['mine'\]"):
         rehearse(build(Pickles))
+    with pytest.raises(UserError, match=r"Nests\.on_save_checkpoint: checkpoint\['mine'\]"):
+        rehearse(build(Nests))
     rehearse(build(Keeps))

@@ -232,6 +232,7 @@ RESUMED = {
     "logger.tensorboard.save_dir=src": "type it as well",
     "trainer.default_root_dir=src": "type it as well",
     "optimizer.lr=${oc.env:HOSTILE}": "calls a function",
+    "optimizer.lr=${${seed}:HOSTILE}": "calls a function",
 }
 
 

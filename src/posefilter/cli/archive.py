@@ -12,11 +12,12 @@ import torch
 from torch import Tensor, nn
 from torch.overrides import TorchFunctionMode
 
-from posefilter.cli.pickles import check_pickle
 from posefilter.cli.plain import walk
 from posefilter.errors import UserError
 from posefilter.geometry.pose import is_rigid
+from posefilter.models.quantization import OFFSET
 from posefilter.paths import is_plain_name
+from posefilter.pickles import check_pickle
 
 _LARGEST = 8 << 30  # bytes of a file
 _MOST_FILES = 50_000  # in an archive
@@ -130,7 +131,8 @@ def _check_object(model: Any) -> None:
     packed = isinstance(model, dict) and model.get("texture_look") is not None
     later = {"texture": (-1, 3 if packed else 9), "shape_symmetries": (-1, 4, 4)}
     needed = {"name", "radius", "diameter", *shapes}
-    if not isinstance(model, dict) or set(model) - {"parts", "texture_look", *later} != needed:
+    optional = {"parts", "texture_look", OFFSET, *later}
+    if not isinstance(model, dict) or set(model) - optional != needed:
         raise UserError(
             "its object should have name, points, center, radius, diameter, symmetries and hull"
         )
@@ -147,6 +149,8 @@ def _check_object(model: Any) -> None:
     held = {key: model[key] for key in shapes}
     held |= {key: model[key] for key in later if model.get(key) is not None}
     named = {key: (value, (shapes | later)[key]) for key, value in held.items()}
+    if OFFSET in model:
+        named[OFFSET] = (model[OFFSET], (3,))
     named |= {f"part {part}": (points, (-1, 3)) for part, points in parts.items()}
     for key, (value, shape) in named.items():
         fits = isinstance(value, Tensor) and value.dim() == len(shape) and value.is_floating_point()

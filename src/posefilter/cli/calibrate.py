@@ -73,7 +73,8 @@ def calibrate(job: Job) -> None:
             "filter: a calibration belongs to the filter as the checkpoint has it; export.py "
             "writes a checkpoint with another"
         )
-    file = find_checkpoint(cfg.checkpoint)
+    # of a link the file that it leads to: both names have the calibration then
+    file = find_checkpoint(cfg.checkpoint).resolve()
     out = file if cfg.out is None else Path(str(cfg.out))
     if out.exists():  # a training that still runs may write a better one meanwhile, which is kept
         hold(file.parent.parent if file.parent.name == "checkpoints" else file.parent)
@@ -92,6 +93,11 @@ def calibrate(job: Job) -> None:
     data = build_data(settings, cfg.console, job.overrides)
     data.setup("validate")
     warn_of_learned(str(file), data, cfg.console, "val")
+    if len(data.val_dataset) < FEWEST:
+        raise UserError(
+            f"{data.root}: {len(data.val_dataset)} frames of its validation scenes show {name}, "
+            f"and {FEWEST} are needed"
+        )
     without = cfg.frames if cfg.absent_frames is None else cfg.absent_frames
     absent = [data.absent_dataset("val", without)]
     if cfg.absent is not None and len(absent[0]) < without:

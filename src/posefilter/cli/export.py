@@ -4,6 +4,7 @@ of the filter chosen anew, if wished); or write its networks for programs of oth
 
 import os
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 from posefilter.cli.checkpoints import is_calibrated_filter, method_of, read_checkpoint
@@ -67,13 +68,16 @@ def write_weights(stripped: dict[str, Any], out: Path, max_mb: float) -> float:
     """Write a stripped checkpoint; return its size [MB].
 
     Raises:
-        UserError: It cannot be used, or is larger than `max_mb`.
+        UserError: It could not be read again, or is larger than `max_mb`.
     """
-    method_of(stripped, lightning=False)
     content = pack_whole(stripped)
     size = len(content) / 1e6
     if size > max_mb:
         raise UserError(f"out={out}: {size:.1f} MB, more than max_mb={max_mb}")
+    with TemporaryDirectory() as folder:  # as whoever gets the file will read it
+        copy = Path(folder) / out.name
+        copy.write_bytes(content)
+        method_of(read_checkpoint(copy), lightning=False)
     write_whole(out, content, sync=True)
     return size
 

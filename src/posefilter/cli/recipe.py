@@ -43,12 +43,17 @@ _REFERENCE = re.compile(r"\$\{([A-Za-z_]\w*(?:\.\w+)*)\}")
 _SELECT = re.compile(r"\$\{oc\.select:([A-Za-z_]\w*(?:\.\w+)*),(-?\d{1,6}|null)\}")
 
 
+def calls_resolver(value: str) -> bool:
+    """Tell whether a setting has an interpolation that is no reference to another setting."""
+    return "${" in _REFERENCE.sub("", value)
+
+
 def resolve_foreign(settings: dict[str, Any]) -> dict[str, Any]:
     """Return settings with every interpolation but references resolved, as a recipe has them."""
     tree = OmegaConf.create(settings)
 
     def resolve_value(value: Any, place: str) -> Any:
-        foreign = isinstance(value, str) and "${" in _REFERENCE.sub("", value)
+        foreign = isinstance(value, str) and calls_resolver(value)
         return resolve(OmegaConf.select(tree, place)) if foreign else value
 
     return dict(map_values(settings, resolve_value))
@@ -156,7 +161,7 @@ def _check_value(path: str, value: Any) -> None:
         ):
             raise UserError(f"its recipe's {where} is no plain text of at most {_LONGEST} letters")
         # a select stands alone: within a text, nobody would see what it refers to
-        if "${" in _REFERENCE.sub("", value) and not _SELECT.fullmatch(value):
+        if calls_resolver(value) and not _SELECT.fullmatch(value):
             raise UserError(
                 f"its recipe's {where}={value[:60]!r} may only refer to another setting, such as "
                 "${filter}"

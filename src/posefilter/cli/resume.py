@@ -10,6 +10,7 @@ from hydra.errors import HydraException
 
 from posefilter.cli.arguments import quoted
 from posefilter.cli.plain import find, key_of
+from posefilter.cli.recipe import calls_resolver
 from posefilter.cli.renamed import update
 from posefilter.errors import BadData, UserError, naming
 from posefilter.limits import read_bytes, read_yaml
@@ -126,7 +127,7 @@ def check_override(override: str) -> None:
             f"{override[:80]!r} in its .hydra/overrides.yaml is not a setting of a training run"
         )
     key, value = found[2], (found[3] or "").strip("'\"")
-    if re.search(r"\$\{[^}]*:", value):
+    if calls_resolver(value):
         raise UserError(f"its {key} calls a function; if that is right, type {key}=... yourself")
     words = [word for word in re.split(r"[\[\]{},\s'\"]|:(?!//)", value) if word]
     sends = key == "logger" and not {*words}.isdisjoint(_SENDING)

@@ -23,6 +23,7 @@ from posefilter.cli.job import Job
 from posefilter.cli.learned import DATA, list_learned
 from posefilter.cli.machine import settle
 from posefilter.cli.ranks import is_follower
+from posefilter.cli.recipe import check_recipe
 from posefilter.cli.results import record, show, write_json
 from posefilter.cli.resume import LAST, list_unkept
 from posefilter.cli.reuse import find_begun, finished, learned_from, start_from, take_over
@@ -30,7 +31,7 @@ from posefilter.cli.stopping import stopped_by_interrupt
 from posefilter.cli.warm_start import read_starts, warm_start
 from posefilter.data.loaders import count_batches
 from posefilter.data.module import PoseDataModule
-from posefilter.errors import Stopped, UserError
+from posefilter.errors import Stopped, UserError, naming
 from posefilter.metrics.results import compute_checkpoint_score
 from posefilter.models.base import PoseEstimator
 from posefilter.models.rehearsal import check_method
@@ -78,7 +79,10 @@ def build(job: Job) -> Run:
     """
     settle(job.cfg.threads, job.cfg.seed)
     # first, since they are the sooner to complain
-    method, trainer = build_method(recipe(job)), build_trainer(job)
+    settings = recipe(job)
+    with naming("what it trains could not be read again"):
+        check_recipe(settings)
+    method, trainer = build_method(settings), build_trainer(job)
     data = build_data(job.cfg.data, job.cfg.console, job.overrides)
     data.setup("fit")
     if len(data.objects) > 1:

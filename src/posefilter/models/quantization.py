@@ -18,7 +18,7 @@ from posefilter.types import ObjectModel
 
 _LEAST = 4096  # smaller tensors are not worth a scale
 _SUFFIX = "#scale"
-_OFFSET = "points_from"  # the point that packed points are relative to, where there is one
+OFFSET = "points_from"  # the point that packed points are relative to, where there is one
 _FAR = 0.25  # [m] of the object's center from its origin, where half precision is 0.1 mm
 
 
@@ -69,12 +69,12 @@ def pack_object(plain: Mapping[str, Any]) -> dict[str, Any]:
 
     Where the origin of the mesh is far from the object, points are relative to its center.
     """
-    if _OFFSET in plain:
+    if OFFSET in plain:
         return dict(plain)
     texture, points = plain.get("texture"), plain["points"]
     out = dict(plain)
     if float(plain["center"].norm()) > _FAR:
-        out[_OFFSET] = plain["center"]
+        out[OFFSET] = plain["center"]
         points = points - plain["center"].to(points)
         if texture is not None:
             texture = texture.float()
@@ -91,7 +91,7 @@ def pack_object(plain: Mapping[str, Any]) -> dict[str, Any]:
 def unpack_object(packed: Mapping[str, Any]) -> ObjectModel:
     """Return the object that a checkpoint holds, its surface points in full precision."""
     fields = {**packed, "points": packed["points"].float()}
-    look, offset = fields.pop("texture_look", None), fields.pop(_OFFSET, None)
+    look, offset = fields.pop("texture_look", None), fields.pop(OFFSET, None)
     if look is not None:
         normals, colors = (look.float() / 255).chunk(2, dim=1)
         normals = F.normalize(2 * normals - 1, dim=1)

@@ -7,6 +7,7 @@ each of its parts is watched. The method itself is left as it is, and so are the
 import inspect
 import io
 import logging
+import zipfile
 from collections.abc import Callable, Mapping
 from copy import deepcopy
 from typing import Any
@@ -20,6 +21,7 @@ from torch import Tensor, nn
 from posefilter.errors import UserError
 from posefilter.geometry.pose import is_rigid
 from posefilter.models.base import PoseEstimator
+from posefilter.pickles import check_pickle
 from posefilter.types import Batch, BeliefBatch, ParticleOutput, Particles, Resampled, Step, Trace
 
 log = logging.getLogger(__name__)
@@ -117,6 +119,7 @@ def _check_checkpoint(method: PoseEstimator) -> None:
         file = io.BytesIO()
         try:
             torch.save(value, file)
+            check_pickle(_read_pickle(file))
             file.seek(0)
             torch.load(file, weights_only=True)
         except Exception as error:  # pickle raises what it likes
@@ -124,6 +127,12 @@ def _check_checkpoint(method: PoseEstimator) -> None:
                 f"{who}: checkpoint['{key}'] holds other than tensors, numbers, texts, lists and "
                 f"dicts, which no command reads again"
             ) from error
+
+
+def _read_pickle(file: io.BytesIO) -> bytes:
+    """Return the pickle of what torch.save wrote."""
+    with zipfile.ZipFile(file) as archive:
+        return next(archive.read(one) for one in archive.namelist() if one.endswith("data.pkl"))
 
 
 def _need(good: bool, who: str, told: str) -> None:
