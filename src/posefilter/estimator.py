@@ -170,7 +170,8 @@ class Estimator:
                 Batch(*(x.to(method.device) for x in make_batch(one, *own)))
                 for method, own in zip(self.methods, self._sizes, strict=True)
             ]
-            found, seconds = detect(self.methods, batches, counts, self.costs)
+            asked = self.costs, self.pose_tolerance
+            found, seconds = detect(self.methods, batches, counts, *asked)
             many = Counter(each.number for each in found)
             before, results = Counter[int](), []
             for each in found:

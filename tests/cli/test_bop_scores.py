@@ -48,7 +48,9 @@ def list_truths(root: Path) -> list[PoseRow]:
     return rows
 
 
-def evaluate(rows: list[PoseRow], scenes: Path, out: Path, targets: str = "all") -> dict:  # type: ignore[type-arg]
+def evaluate(  # type: ignore[type-arg]
+    rows: list[PoseRow], scenes: Path, out: Path, targets: str = "all", *more: str
+) -> dict:
     out.mkdir()
     write_poses_csv(out / "poses.csv", rows)
     typed = [
@@ -60,6 +62,7 @@ def evaluate(rows: list[PoseRow], scenes: Path, out: Path, targets: str = "all")
         f"targets={targets}",
         f"out={out / 'scores'}",
         "console=json",
+        *more,
     ]
     assert run_command("evaluate", arguments=typed) == 0
     content: dict = json.loads((out / "scores" / "metrics.json").read_text())  # type: ignore[type-arg]
@@ -84,6 +87,19 @@ def test_each_instance_is_scored_by_the_estimate_that_is_nearest(
     assert missed["bop"]["ar_mssd"] == pytest.approx(50, abs=10)
     assert missed["bop"]["estimates"] == 4  # as many of an image as there are instances
     assert missed["add"]["recall_01d"] == pytest.approx(50)
+
+
+@pytest.mark.parametrize("limit", [1, 2, 3])
+def test_of_some_instances_of_an_image_each_has_its_own_estimate(
+    limit: int, scenes: Path, tmp_path: Path
+) -> None:
+    rows = list_truths(scenes)
+    some = evaluate(rows, scenes, tmp_path / "some", "all", f"data.limit_test={limit}")
+    assert some["instances"] == limit
+    assert some["missed"] == 0
+    assert some["add"]["median_mm"] < 0.01
+    assert some["bop"]["ar"] == 100
+    assert some["bop"]["targets"] % 2 == 0  # whole images
 
 
 def test_the_table_of_errors_has_each_number_in_its_column(scenes: Path, tmp_path: Path) -> None:

@@ -9,6 +9,7 @@ import torch
 from torch import Generator, Tensor
 
 from posefilter.confidence.calibration import Assessment
+from posefilter.confidence.tolerance import PoseTolerance
 from posefilter.confidence.verdicts import Costs
 from posefilter.errors import UserError
 from posefilter.estimator import count_instances
@@ -244,6 +245,54 @@ def test_pixels_are_given_anew_in_each_round() -> None:
     (left,) = resolve([kept[0.6], doubted])
     assert left.probability == 0.6
     assert int(left.mask.sum()) == 100
+
+
+def test_what_is_one_too_many_takes_no_pixels() -> None:
+    first, better = make_detection(0, 100, 0.55), make_detection(120, 180, 0.97)
+    other = make_detection(0, 90, 0.5)._replace(number=1)
+    assert [one.probability for one in resolve([first, better, other])] == [0.97, 0.55]
+    found = resolve([first, better, other], [1, 1])
+    assert [(one.number, one.probability) for one in found] == [(0, 0.97), (1, 0.5)]
+    assert int(found[1].mask.sum()) == 90
+    assert [one.number for one in resolve([first, better, other], [2, 1])] == [0, 0]
+
+
+def test_an_answer_that_is_surplus_in_the_end_does_not_hide_another_class() -> None:
+    """It was the first of its class, and on the place of the other's only answer."""
+    first, second = Toy(0), Toy(1)
+    image = draw([(4, 5, 0, 0.6), (40, 30, 0, 0.5)])
+    image.rgb[0, 1, 5 : 5 + SIDE, 4 : 4 + SIDE] = 0.55  # both classes see this square
+
+    def assess(trace: Trace, batch: Batch) -> Assessment:
+        u = trace.belief.best[0, 0, 3] > 0  # where the first class has its second answer
+        said = torch.tensor([0.97 if u else 0.6]).double()
+        return Assessment(said, said)
+
+    first.assess = assess  # type: ignore[method-assign]
+    found = run([first, second], [1, 1], image)
+    assert [(one.number, round(one.probability, 2)) for one in found] == [(0, 0.97), (1, 0.55)]
+    assert corners(found) == [(40, 30), (4, 5)]
+
+
+def test_the_verdict_goes_by_a_tolerance_where_one_is_given() -> None:
+    """The object is there, its turn is not sure, and a miss is cheap."""
+
+    class Turned(Toy):
+        def assess(self, trace: Trace, batch: Batch) -> Assessment:
+            said = torch.tensor([0.95, 0.5]).double()
+            return Assessment(said[:1], said[1:], {"a": said[:1]})
+
+    class Calibrated:
+        def assess(self, values: Any, tolerance: PoseTolerance) -> Assessment:
+            assert tolerance == PoseTolerance(add_s=0.1)
+            return Assessment(values["a"], 0.99 * values["a"])
+
+    toy, batch, costs = Turned(0), draw(THREE[:1]), Costs(miss=0.5)
+    toy.calibration = Calibrated()  # type: ignore[attr-defined]
+    asked = [cast(PoseEstimator, toy)], [batch], [1], costs
+    assert detect(*asked)[0] == []
+    ((one,), _) = detect(*asked, PoseTolerance(add_s=0.1))
+    assert one.within == pytest.approx(0.94, abs=0.01)
 
 
 def test_an_answer_that_is_absent_after_all_takes_no_place() -> None:

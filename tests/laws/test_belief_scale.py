@@ -24,7 +24,7 @@ from posefilter.confidence.calibration import Calibration, read_calibration
 from posefilter.confidence.logistic import Logistic
 from posefilter.errors import UserError
 from posefilter.geometry.pose import make_pose, move_about
-from posefilter.geometry.rotation import exp_so3, random_rotation
+from posefilter.geometry.rotation import exp_so3, log_so3, random_rotation
 from posefilter.metrics.credibility import score_truth
 from posefilter.models.base import PoseEstimator
 from posefilter.types import BeliefBatch, ObjectModel
@@ -303,6 +303,11 @@ def test_of_a_continuous_symmetry_any_turn_is_as_dense() -> None:
     at, beside = (score_truth(out, one, bowl) for one in (beliefs.best, between))
     assert float((at.log_density - beside.log_density).abs().max()) < 1
     assert float(beside.rank.max()) < 0.5
+    # turned to either side alike: the mean is the estimate
+    for poses, best in zip(out.poses.double(), beliefs.best.double(), strict=True):
+        about_z = log_so3(best[:3, :3].mT @ poses[:, :3, :3])[:, 2]
+        assert abs(math.degrees(float(about_z.mean()))) < 0.5
+        assert math.degrees(float(about_z.std())) > 2
 
 
 def test_one_particle_and_none_near_the_estimate_become_a_belief_about_it() -> None:

@@ -18,6 +18,12 @@ from posefilter.types import BeliefBatch, ObjectModel
 CENTER = torch.zeros(3)
 
 
+def test_a_group_without_frames_gives_all_poses() -> None:
+    empty = Conformal((0.5,), ((), (1.0, 2.0)))
+    assert empty.find_limit(0.0, 0.1) == math.inf
+    assert empty.find_limit(0.0, 0.9) == 1.0
+
+
 @pytest.mark.parametrize("level", [0.5, 0.9])
 def test_coverage_on_exchangeable_frames_is_at_least_the_level_and_hardly_more(
     level: float,

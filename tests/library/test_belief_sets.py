@@ -182,6 +182,7 @@ def test_symmetries_are_saved_and_files_without_them_are_read(tmp_path: Path) ->
         ("flat", np.eye(4)),
         ("mirror", np.diag([-1.0, 1, 1, 1])[None]),
         ("many", np.repeat(np.eye(4)[None], 10_001, 0)),
+        ("other", half_turn()[1:]),  # as BOP lists them, without the identity
     ):
         np.savez(tmp_path / f"{name}.npz", **arrays, symmetries=symmetries)
         with pytest.raises(UserError, match=f"{name}.npz: belief: .*symmetries") as caught:
@@ -309,6 +310,22 @@ def test_a_turn_about_a_continuous_symmetry_is_no_uncertainty() -> None:
     assert math.degrees(sure.rotation) < 0.61
     assert sure.translation == pytest.approx(0, abs=1e-9)
     assert sure.mass > 0.95
+
+
+def test_turned_poses_stay_in_the_sets_of_a_belief_that_was_brought_together() -> None:
+    scale = np.array([0.002, 0.002, 0.002, 0.02, 0.02, 0.02])
+    belief = belief_of(draw(200, 21, scale), symmetries=any_turn())
+    other = belief_of(draw(200, 22, scale), symmetries=any_turn())
+    pose = middle().numpy()
+    for one in (belief, belief.canonicalize(pose), belief.fuse(other)):
+        density = []
+        for degrees in (0.0, 2.5, 5.0, 7.5, 90.0, 123.0):
+            turn = torch.tensor([0, 0, 0, 0, 0, math.radians(degrees)]).double()
+            turned = move_about(middle(), turn, torch.from_numpy(CENTER)).numpy()
+            density.append(float(one.log_density(turned)))
+            assert one.contains(turned, 0.9)
+        assert np.ptp(density) < 1.5
+    assert belief.fuse(other).differential_entropy < belief.differential_entropy
 
 
 def test_the_covariance_about_a_pose_holds_its_offset_and_forgets_the_symmetry() -> None:

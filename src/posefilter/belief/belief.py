@@ -36,7 +36,7 @@ from posefilter.geometry.pose_density import (
 )
 from posefilter.geometry.pose_statistics import covariance_about, twist_between
 from posefilter.geometry.spaces import PoseSpace
-from posefilter.geometry.symmetries import densify, gather_copies
+from posefilter.geometry.symmetries import densify, gather_copies, spread_turns
 from posefilter.types import ObjectModel
 
 _MOST_SYMMETRIES = 10_000  # as many as an object may have (meshes/symmetries.py)
@@ -101,6 +101,10 @@ class Belief:
         for name, poses in (("samples", self.samples), ("symmetries", group)):
             if not np.isfinite(poses).all() or not is_rigid(torch.from_numpy(poses)):
                 raise UserError(f"belief: the {name} should be rigid transforms")
+        if not np.allclose(group[0], np.eye(4), atol=_ROUNDING):
+            raise UserError(
+                "belief: the first of the symmetries should be the identity, which BOP's lists omit"
+            )
         if self.center.shape != (3,) or not np.isfinite(self.center).all():
             raise UserError(f"belief: the center should be three numbers, not {self.center}")
         if not isinstance(self.draws, Integral) or not 0 <= self.draws <= count:
@@ -470,6 +474,10 @@ class Belief:
     def _density(self) -> PoseDensity:
         samples, weights = self._tensors
         own, group = torch.from_numpy(self.center), torch.from_numpy(self.symmetries)
+        dense = densify(group)
+        if len(dense) > len(group):  # however the samples are turned about the axis
+            about = samples[weights.argmax()]
+            samples = spread_turns(gather_copies(samples, about, own, self.radius, dense), group)
         return fit_density(samples, weights.log(), own, self.radius, self.diameter, group)
 
     @cached_property

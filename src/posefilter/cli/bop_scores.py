@@ -34,31 +34,33 @@ def assign_estimates(
     """Return the estimate of each instance, by the record's key.
 
     Of a class that an image shows once, it is the most confident estimate. Of several instances,
-    the most confident estimates, as many as there are instances, are matched in turn to the nearest
-    instance by MSSD.
+    the most confident estimates, as many as the image has instances, are matched in turn to the
+    nearest instance by MSSD.
 
     Args:
         rows: The estimates.
-        records: The instances.
+        records: The instances that are tested, of their images some or all.
         data: Their dataset.
     """
-    groups = _group(records)
     by_key = sort_rows(rows)
     place = {record.key: i for i, record in enumerate(data.reader.records())}
+    tested = {record.key for record in records}
     out: dict[str, PoseRow] = {}
-    for key, own in groups.items():
-        known = by_key.get(key, [])[: len(own)]
-        if len(own) == 1:
-            if known:
-                out[own[0].key] = known[0]
+    for key, every in _group_whole(records, data.reader).items():
+        own, known = every, by_key.get(key, [])
+        if len(every) > 1:
+            read = _read_shown([place[record.key] for record in every], data.reader)
+            own, samples = [every[i] for i, _ in read], [sample for _, sample in read]
+        if len(own) == 1 and known:
+            out[own[0].key] = known[0]
+        if len(own) < 2:
             continue
         object_model = data.object_model(data.objects.index(own[0].object))
-        samples = [data.reader.read(place[record.key]) for record in own]
-        truths, poses = _stack_poses(samples, known, data.reader)
+        truths, poses = _stack_poses(samples, known[: len(own)], data.reader)
         points = torch.cat([object_model.hull, object_model.points]).double()
         errors = _pair(mssd, poses, truths, densify(object_model.symmetries.double()), points)
         out |= {own[t].key: known[e] for e, t in match_greedily(errors, np.inf)}
-    return out
+    return {key: row for key, row in out.items() if key in tested}
 
 
 def score_targets(
@@ -71,7 +73,8 @@ def score_targets(
 
     Args:
         rows: The estimates.
-        targets: What is to be found; None: of `records`, all of visibility 0.1 or more.
+        targets: What is to be found; None: of the images and classes of `records`, all instances of
+            visibility 0.1 or more.
         records: The instances that are tested.
         data: Their dataset, with the meshes of its objects.
 
@@ -82,10 +85,11 @@ def score_targets(
     Raises:
         UserError: A target is not in the data, or an object has no mesh.
     """
-    groups = _group(records if targets is None else data.reader.records())
-    classes = {record.obj_id for record in data.reader.records()}
+    every = data.reader.records()
+    groups = _group_whole(records, data.reader) if targets is None else _group(every)
+    classes = {record.obj_id for record in every}
     counts = None if targets is None else {one[:3]: one.inst_count for one in targets}
-    place = {record.key: i for i, record in enumerate(data.reader.records())}
+    place = {record.key: i for i, record in enumerate(every)}
     by_key = sort_rows(rows)
     judge = _Judge(data)
     scored, used, left_out = list[TargetErrors](), 0, 0
@@ -95,12 +99,13 @@ def score_targets(
             hint = "" if key[2] in classes else " (data.object=null takes all objects)"
             raise UserError(f"targets: the data have no instance of {names}{hint}")
         try:
-            samples = _read_shown([place[record.key] for record in groups[key]], data.reader)
+            read = _read_shown([place[record.key] for record in groups[key]], data.reader)
         except BadData:
             if data.reader.on_error != "skip":
                 raise
             left_out += 1
             continue
+        samples = [sample for _, sample in read]
         shares = [data.reader.visible_share(sample) for sample in samples]
         order = np.argsort(-np.nan_to_num(shares, nan=1.0), kind="stable").tolist()
         if counts is None:
@@ -116,12 +121,14 @@ def score_targets(
     return {**compute_average_recall(scored), **counted}
 
 
-def _read_shown(places: Sequence[int], reader: BaseReader) -> list[Sample]:
-    """Return the instances of which a pixel is seen; the others are no targets."""
+def _read_shown(places: Sequence[int], reader: BaseReader) -> list[tuple[int, Sample]]:
+    """Return the instances of which a pixel is seen, each with its number; the others are no
+    targets.
+    """
     samples = []
-    for place in places:
+    for i, place in enumerate(places):
         with suppress(NotShown):
-            samples.append(reader.read(place))
+            samples.append((i, reader.read(place)))
     return samples
 
 
@@ -195,6 +202,17 @@ def _group(items: Iterable[_Item]) -> dict[Key, list[_Item]]:
     for one in items:
         out.setdefault((one.scene_id, one.im_id, one.obj_id), []).append(one)
     return out
+
+
+def _group_whole(
+    records: Sequence[FrameRecord], reader: BaseReader
+) -> dict[Key, list[FrameRecord]]:
+    """Return all instances of the images and classes of some of them: an estimate that is of
+    another instance than those is not theirs.
+    """
+    some = _group(records)
+    every = _group(reader.records())
+    return {key: every[key] for key in some}
 
 
 def sort_rows(rows: Sequence[PoseRow]) -> dict[Key, list[PoseRow]]:

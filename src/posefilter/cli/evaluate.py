@@ -99,7 +99,7 @@ def _of_checkpoint(job: Job) -> tuple[dict[str, Any], dict[str, Path]]:
     settings = data_settings(job, checkpoint["recipe"]["settings"], method.object_model.name)
     data = build_data(settings, job.cfg.console, job.overrides)
     data.setup("test")
-    method.set_object(object_to_judge(data, method.object_model))
+    judge_by(method, object_to_judge(data, method.object_model))
     if method.calibration is None and checkpoint.get("calibration") is not None:
         warn(job.cfg.console, f"no probabilities: {method.calibration_note}")
     warn_of_several(data, job.cfg.console)
@@ -331,6 +331,22 @@ def _bop_split(data: Mapping[str, Any]) -> Any:
     """Return which folder of a dataset in BOP's layout is read, such as train_pbr."""
     options = data.get("options")
     return options.get("split") if isinstance(options, Mapping) else None
+
+
+def judge_by(method: PoseEstimator, theirs: ObjectModel) -> None:
+    """Give a method the object that a dataset judges it by, see `object_to_judge`.
+
+    A calibration of an object without symmetries knows other features than one of an object with
+    some: where the dataset disagrees with the checkpoint, it is left out.
+    """
+    known, declared = len(method.object_model.symmetries), len(theirs.symmetries)
+    if (known > 1) != (declared > 1):
+        method.calibration = None
+        method.calibration_note = (
+            f"the dataset's meshes declare {declared - 1} symmetries of {theirs.name}, and the "
+            f"checkpoint was calibrated with {known - 1}"
+        )
+    method.set_object(theirs)
 
 
 def object_to_judge(data: PoseDataModule, own: ObjectModel) -> ObjectModel:

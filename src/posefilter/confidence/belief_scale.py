@@ -30,7 +30,7 @@ from torch import Tensor
 
 from posefilter.geometry.pose import move_about
 from posefilter.geometry.pose_statistics import twist_between
-from posefilter.geometry.symmetries import densify, gather_copies
+from posefilter.geometry.symmetries import densify, gather_copies, spread_turns
 from posefilter.types import BeliefBatch, ObjectModel
 
 FEWEST_RIGHT = 10  # frames with a right estimate that a fit takes
@@ -254,27 +254,15 @@ def _redraw(
         mass = max(mass, own / count)
     draws = factor * draw_student_t(own, scale.degrees)
     twist = draws @ torch.linalg.cholesky(scale.find_shape(scatter)).mT / _unit(object_model)
-    drawn = _turn_between(
-        move_about(best, twist, object_model.center.detach().cpu().double()), object_model
+    drawn = spread_turns(
+        move_about(best, twist, object_model.center.detach().cpu().double()),
+        object_model.symmetries.detach().cpu().double(),
     )
     log_weights = torch.full((count,), math.log(mass / own), dtype=torch.float64)
     if rest:
         log_weights[own:] = math.log((1 - mass) / rest)
         drawn = torch.cat([drawn, _resample(poses, weights.masked_fill(near, 0), rest)])
     return drawn, log_weights, own
-
-
-def _turn_between(poses: Tensor, object_model: ObjectModel) -> Tensor:
-    """Return poses (N, 4, 4), of an object with a continuous symmetry turned about its axis by up
-    to the least of its turns.
-
-    A density knows such an object by few turns, and poses about one alone would leave gaps between
-    them.
-    """
-    group = object_model.symmetries.detach().cpu().double()
-    between = densify(group)[:: len(group)]  # the turns from one to the next
-    # the same for both of a pair
-    return poses @ between[torch.arange(len(poses)) // 2 % len(between)]
 
 
 def _resample(poses: Tensor, weights: Tensor, count: int) -> Tensor:

@@ -70,7 +70,7 @@ class Conformal:
         """
         own = self.scores[self.find_group(value)]
         rank = math.ceil(round(level * (len(own) + 1), 9))
-        return math.inf if rank > len(own) else own[max(rank, 1) - 1]
+        return math.inf if rank > len(own) or not own else own[max(rank, 1) - 1]
 
 
 def choose_edges(probability: np.ndarray) -> tuple[float, ...]:

@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from posefilter.geometry.pose import (
+    invert,
     origin_of,
     pose_about,
     rotation_of,
@@ -50,6 +51,27 @@ def densify(symmetries: Tensor, step: float = _STEP) -> Tensor:
         part[:3, 3] = point - part[:3, :3] @ point
         parts.append(symmetries @ part)
     return torch.cat(parts)
+
+
+def spread_turns(poses: Tensor, symmetries: Tensor) -> Tensor:
+    """Return poses, of an object with a continuous symmetry turned about its axis by up to half the
+    least of its turns to either side.
+
+    A density knows such an object by few turns, and poses about one alone would leave gaps between
+    them.
+
+    Args:
+        poses: (N, 4, 4) camera_from_object [m]; two that follow each other are turned alike.
+        symmetries: (S, 4, 4) object_from_object.
+
+    Returns:
+        (N, 4, 4); as given without a continuous symmetry.
+    """
+    between = densify(symmetries)[:: len(symmetries)]  # the turns from one to the next
+    if len(between) == 1:
+        return poses
+    between = invert(between[len(between) // 2]) @ between
+    return poses @ between[torch.arange(len(poses)) // 2 % len(between)]
 
 
 def is_ball(symmetries: Tensor) -> bool:

@@ -11,6 +11,7 @@ from torch import Generator, Tensor
 
 from posefilter.confidence.calibration import Assessment
 from posefilter.confidence.second_look import measure_worth
+from posefilter.confidence.tolerance import PoseTolerance
 from posefilter.confidence.verdicts import Costs, Verdict, decide
 from posefilter.confidence.visible_pixels import blank, find_visible
 from posefilter.filters.loop import ParticleFilter
@@ -39,6 +40,7 @@ class Detection(NamedTuple):
     assessment: Assessment | None  # None where the method is not calibrated
     visible: Tensor  # (H, W) bool, its visible pixels, of the first method's image
     mask: Tensor  # (H, W) bool, those that are its own: a more probable answer keeps the others
+    within: float | None = None  # that it is there and within a tolerance, where one was given
 
     @property
     def probability(self) -> float:
@@ -56,6 +58,7 @@ class _Job:
     count: int  # instances at most
     filter: ParticleFilter
     generator: Generator
+    tolerance: PoseTolerance | None = None
     searches: int = 0
     exhausted: bool = False
     seconds: float = 0.0
@@ -63,7 +66,11 @@ class _Job:
 
 @torch.no_grad()
 def detect(
-    methods: Sequence[PoseEstimator], batches: Sequence[Batch], counts: Sequence[int], costs: Costs
+    methods: Sequence[PoseEstimator],
+    batches: Sequence[Batch],
+    counts: Sequence[int],
+    costs: Costs,
+    tolerance: PoseTolerance | None = None,
 ) -> tuple[list[Detection], list[float]]:
     """Find the instances of several classes in one image, no two on the same pixels.
 
@@ -74,19 +81,28 @@ def detect(
         batches: The image, as each method takes it.
         counts: Instances of each class at most.
         costs: What errors cost: an object that is absent by these is left out.
+        tolerance: What a right pose is, which verdicts go by; None: that of the probability.
 
     Returns:
         What is found, the most probable first; and the seconds that each class took.
     """
-    jobs = [_begin(i, *one) for i, one in enumerate(zip(methods, batches, counts, strict=True))]
+    classes = zip(methods, batches, counts, strict=True)
+    jobs = [_begin(i, *one, tolerance) for i, one in enumerate(classes)]
     grid = (batches[0].depth.shape[-2], batches[0].depth.shape[-1])
     found: list[Detection] = []
+    dropped: list[Detection] = []
     while any(_is_open(job, found, costs) for job in jobs):
         fresh = [_search(job, found, grid, costs) for job in jobs if _is_open(job, found, costs)]
-        found = resolve([*found, *(one for one in fresh if one is not None)])
+        every = [*found, *(one for one in fresh if one is not None)]
+        found = resolve(every)
+        kept = {id(one.visible) for one in found}
+        dropped += [one for one in every if id(one.visible) not in kept]
         found = [_judge_again(jobs[one.number], one, found, grid, costs) for one in found]
     there = [one for one in found if is_there(one, costs)]
-    return _keep_best(resolve(there), counts), [job.seconds for job in jobs]
+    out = resolve(there)
+    if len(_keep_best(out, counts)) < len(out):  # what is left out after all takes no pixels
+        out = resolve([*there, *dropped], counts)
+    return out, [job.seconds for job in jobs]
 
 
 def is_there(one: Detection, costs: Costs) -> bool:
@@ -96,25 +112,42 @@ def is_there(one: Detection, costs: Costs) -> bool:
     return _judge(one, costs) != "absent"
 
 
-def resolve(found: Sequence[Detection]) -> list[Detection]:
+def resolve(found: Sequence[Detection], counts: Sequence[int] | None = None) -> list[Detection]:
     """Return the detections that keep pixels, the most probable first.
 
     The more probable answer keeps the pixels, and one that has hardly any of its own is dropped.
     Those without a probability come last, by their scores.
+
+    Args:
+        found: Detections of one image.
+        counts: How many of each class keep pixels at most; None: all.
     """
     order = sorted(found, key=lambda one: (-one.probability, -float(one.belief.score[0])))
-    kept = keep_pixels([one.visible for one in order], _SHARE)
-    pairs = zip(order, kept, strict=True)
-    return [one._replace(mask=mask) for one, mask in pairs if mask is not None]
+    while True:
+        kept = keep_pixels([one.visible for one in order], _SHARE)
+        pairs = zip(order, kept, strict=True)
+        out = [one._replace(mask=mask) for one, mask in pairs if mask is not None]
+        best = out if counts is None else _keep_best(out, counts)
+        if len(best) == len(out):
+            return out
+        # the first that is one too many: without it others may keep theirs
+        excess = next(one for i, one in enumerate(out) if i >= len(best) or best[i] is not one)
+        order = [one for one in order if one.visible is not excess.visible]
 
 
-def _begin(number: int, method: PoseEstimator, batch: Batch, count: int) -> _Job:
+def _begin(
+    number: int,
+    method: PoseEstimator,
+    batch: Batch,
+    count: int,
+    tolerance: PoseTolerance | None = None,
+) -> _Job:
     small = copy.copy(method.filter)
     small.particles = min(small.particles, _PARTICLES)
     small.initial_particles = min(small.initial_particles, _INITIAL_PARTICLES)
     if isinstance(small.resample, NoResampling):  # it keeps as many as it begins with
         small.particles = small.initial_particles
-    return _Job(number, method, batch, count, small, method.generator("predict", 0))
+    return _Job(number, method, batch, count, small, method.generator("predict", 0), tolerance)
 
 
 def _is_open(job: _Job, found: Sequence[Detection], costs: Costs) -> bool:
@@ -142,7 +175,8 @@ def _search(
         # with the pixels of others, so that an answer beside what is found, of the same object, is
         # seen to have too few of its own
         whole = resize_mask(visible, grid)
-        one = Detection(job.number, trace.belief, assessment, whole, whole)
+        within = _assess_within(job, assessment)
+        one = Detection(job.number, trace.belief, assessment, whole, whole, within)
         one = one if bool((visible & ~hidden).any()) and is_there(one, costs) else None
     job.exhausted = one is None
     job.seconds += time.perf_counter() - start
@@ -161,7 +195,8 @@ def _judge_again(
         return one
     start = time.perf_counter()
     image, encoding = _encode(job, _hide(job, others) & ~_hide(job, [one]))
-    again = one._replace(assessment=_assess(job.method, one.belief, image, encoding))
+    assessment = _assess(job.method, one.belief, image, encoding)
+    again = one._replace(assessment=assessment, within=_assess_within(job, assessment))
     job.seconds += time.perf_counter() - start
     return again
 
@@ -187,11 +222,20 @@ def _assess(
     return method.assess(Trace((), (), (), belief, encoding=encoding), image)
 
 
+def _assess_within(job: _Job, assessment: Assessment | None) -> float | None:
+    """Return the probability that a pose is within the tolerance; None where there is none."""
+    if job.tolerance is None or assessment is None or assessment.features is None:
+        return None
+    assert job.method.calibration is not None  # it has assessed
+    return float(job.method.calibration.assess(assessment.features, job.tolerance).probability[0])
+
+
 def _judge(one: Detection, costs: Costs) -> Verdict | None:
     """Return the verdict on a detection; None where nothing is known of it."""
     if one.assessment is None:
         return None
-    return decide(float(one.assessment.presence[0]), one.probability, costs)
+    right = one.probability if one.within is None else one.within
+    return decide(float(one.assessment.presence[0]), right, costs)
 
 
 def _keep_best(found: Sequence[Detection], counts: Sequence[int]) -> list[Detection]:
