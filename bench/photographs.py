@@ -25,6 +25,10 @@ from photograph_runs import (
     FAR,
     FIFTH,
     FOURTH,
+    OBJECTS,
+    SIXTH,
+    SIXTH_FRAMES,
+    SIXTH_SPLIT,
     SPLIT,
     TARGETS,
     THIRD,
@@ -57,26 +61,38 @@ def render_commands(
     objects, as the runs before `shipped` had it, 14 x 180 frames have no more than 180 layouts and
     30 sets of backgrounds and distractors.
     """
-    common = [f"frames={frames}", "frames_per_scene=2", "size=[320,240]", "distractors=[4,10]"]
-    common += [f"lookalike_texture={lookalike_texture}", f"meshes={root / 'meshes'}"]
     return [
-        ["generate.py", f"out={root / folder / name}", f"object={name}", f"seed={seed}", *common]
+        render_command(root / folder / name, name, seed, frames, lookalike_texture, root)
         for seed, name in enumerate(TARGETS, start=first_seed)
     ]
 
 
+def render_command(
+    out: Path, name: str, seed: int, frames: int, lookalike_texture: str, root: Path
+) -> list[str]:
+    """Return what to run to render the scenes of one object."""
+    common = [f"frames={frames}", "frames_per_scene=2", "size=[320,240]", "distractors=[4,10]"]
+    common += [f"lookalike_texture={lookalike_texture}", f"meshes={root / 'meshes'}"]
+    return ["generate.py", f"out={out}", f"object={name}", f"seed={seed}", *common]
+
+
 def list_sets(root: Path) -> list[list[list[str]]]:
-    """Return the commands of each set but the first: that of the tests, and three to learn from."""
+    """Return the commands of each set but the first: that of the tests, and four to learn from."""
     third = render_commands(root, 400, THIRD, 101)
     fourth = render_commands(root, 400, FOURTH, 201, "different")
     fifth = render_commands(root, 400, FIFTH, 501, "different")
-    return [render_commands(root), third, fourth, fifth]
+    sixth = [
+        render_command(root / SIXTH / OBJECTS[name], OBJECTS[name], seed, frames, "different", root)
+        for name, (seed, frames) in SIXTH_FRAMES.items()
+    ]
+    return [render_commands(root), third, fourth, fifth, sixth]
 
 
 def train_command(run: Run, root: Path, more: Sequence[str] = ()) -> list[str]:
     """Return what to run to train and test one filter on renders."""
     data = ["data=fat", f"data.root={root / run.scenes}", f"data.meshes={root / 'meshes'}"]
-    data += [f"data.object={run.object}", SPLIT if run.scenes == "data" else TRAIN_SPLIT]
+    splits = {"data": SPLIT, SIXTH: SIXTH_SPLIT}
+    data += [f"data.object={run.object}", splits.get(run.scenes, TRAIN_SPLIT)]
     interval = max(500, run.steps // 4)
     budget = [f"trainer.max_steps={run.steps}", f"trainer.val_check_interval={interval}"]
     budget.append("data.min_visibility_test=0.3")
