@@ -47,7 +47,6 @@ smoke: $(STAMP) ## run every method the whole way at toy size
 bench: $(STAMP) ## measure: does training wait for the loader? how fast is the filter beside peers? see bench/peers.py
 	$(PY) bench/loader.py
 	$(PY) bench/peers.py filters $(ARGS)
-	$(PY) bench/peers.py roofline
 
 methods: $(STAMP) ## run (or go on with) every run behind docs/results, and write its tables
 	$(PY) bench/methods.py $(ARGS)

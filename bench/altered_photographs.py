@@ -143,7 +143,9 @@ def write_table(rows: Sequence[dict[str, Any]], page: Path = PAGE) -> None:
     text = page.read_text()
     for title, changes in (("altered", list(CHANGES)), ("sensors", list(SENSORS))):
         files = dict[tuple[str, str], list[dict[str, Any]]]()
-        for row in rows:
+        # of a change that was tested twice, the later
+        once = {(row["object"], row["weights"], row["change"]): row for row in rows}
+        for row in once.values():
             if row["change"] in changes:
                 files.setdefault((row["object"], row["weights"]), []).append(row)
         if not files:

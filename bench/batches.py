@@ -114,6 +114,9 @@ def measure(
     return rows
 
 
+OF_THE_TABLE = ("only", "weights", "overrides", "threads", "size")
+
+
 def main() -> None:
     """Measure, print and write."""
     parser = make_parser(__doc__)
@@ -141,7 +144,9 @@ def main() -> None:
     rows = []
     for threads in options.threads:
         rows += measure(estimator, frames, threads, options.rounds)
-    if not options.weights and not options.overrides:
+    # the table is of the defaults
+    changed = [name for name in OF_THE_TABLE if getattr(options, name) != parser.get_default(name)]
+    if not changed:
         PAGE.write_text(put_table(PAGE.read_text(), "batches", HEAD, rows))
 
 

@@ -178,7 +178,8 @@ def list_tests(run: Run, root: Path, tiny: bool) -> Iterator[str]:
         )
         checkpoint = str(run.folder / "checkpoints" / "best.ckpt")
         checkpoint = checkpoint.replace("=", r"\=").replace(",", r"\,")
-        yield f"evaluate.py checkpoint={checkpoint} {scenes} out={out} console=json"
+        seed = f"seed={run.seed}"  # by which rows of runs.csv are told apart
+        yield f"evaluate.py checkpoint={checkpoint} {scenes} {seed} out={out} console=json"
 
 
 def estimate_minutes(piece: Piece, model: str) -> float:

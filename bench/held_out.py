@@ -40,7 +40,7 @@ from posefilter.data.readers.registry import open_meshes, open_reader
 from posefilter.data.splits import split_records
 from posefilter.memory import keep_freed_memory
 from posefilter.metrics.errors import add, add_s
-from posefilter.metrics.scores import auc
+from posefilter.metrics.scores import auc, median
 
 ROWS = HOME / "docs" / "results" / "held_out.csv"
 SPLIT = {"train": 0.8, "val": 0.05, "test": 0.15}
@@ -157,7 +157,7 @@ def test(
         "add_s_interval": bound_auc(scenes, symmetric),
         "add_recall": recall[0],
         "add_s_recall": recall[1],
-        "median_mm": 1000 * float(plain.median()),
+        "median_mm": 1000 * median(plain),
         "kinds": measure_kinds([kind_of(s.mask > 0) for _, s in frames], plain, symmetric),
     }
     return row, Errors(plain, symmetric, 0.1 * model.diameter)

@@ -82,6 +82,9 @@ def run_filters(options: argparse.Namespace) -> None:
             told = peer_filters.measure(runners, count, steps, options.repeats)
             lines.append(peer_filters.make_lines(count, steps, told))
             print(*lines[-1], sep="\n", flush=True)
+    if None in peers.values():
+        print("not written into the page: its tables have all peers", flush=True)
+        return
     for count, rows in zip(peer_filters.SIZES, lines, strict=True):
         put(f"filters {count}", peer_filters.HEAD, rows)
 
@@ -137,7 +140,8 @@ def run_images(options: argparse.Namespace) -> None:
                 continue
             for method in programs:
                 own = [line for line in lines if line.startswith(f"| {method}:")]
-                put(f"tune {method}", peer_images.HEAD, own)
+                if own:
+                    put(f"tune {method}", peer_images.HEAD, own)
 
 
 def run_roofline(options: argparse.Namespace) -> None:
@@ -155,7 +159,8 @@ def run_tracks(options: argparse.Namespace) -> None:
     where = (options.visp, options.frames, options.meshes)
     for title, head, lines in peer_tracks.measure(*where, names, options.out):
         print(title, *lines, sep="\n", flush=True)
-        put(title, head, lines)
+        if not options.only:  # the page's tables have all objects
+            put(title, head, lines)
 
 
 def put(title: str, head: Any, lines: list[str]) -> None:

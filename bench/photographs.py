@@ -109,7 +109,10 @@ def evaluate_commands(run: Run, root: Path, meshes: str, frames: str) -> list[li
     checkpoint = root / "runs" / run.name / "checkpoints" / "best.ckpt"
     photographs = ["data=ycb_video", f"data.root={frames}", f"data.meshes={meshes}"]
     renders = ["data=fat", f"data.root={root / 'data'}", f"data.meshes={root / 'meshes'}"]
-    tests = {"photographs": photographs, "renders": [*renders, "data.limit_test=24"]}
+    # a run on other scenes has another split: without this one, frames that taught what it began
+    # with would be tested on
+    renders += [SPLIT, "data.min_visibility_test=0.3", "data.limit_test=24"]
+    tests = {"photographs": photographs, "renders": renders}
     common, out = ["evaluate.py", f"checkpoint={checkpoint}"], root / "evals" / run.name
     return [[*common, *where, f"out={out / name}"] for name, where in tests.items()]
 

@@ -21,7 +21,7 @@ import csv
 import re
 import sys
 from collections import defaultdict
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from fnmatch import fnmatch
 from statistics import mean, stdev
 
@@ -117,13 +117,19 @@ def make_table(rows: list[Row], show: list[str], interval: bool = False, omit: s
     }
     for name in show:
         columns[name] = [
-            format_cell([float(run[name]) for run in runs if run[name]], interval)
-            for runs in groups.values()
+            format_runs([run[name] for run in runs], interval) for runs in groups.values()
         ]
     for name in ("method", "variant", "changed"):
         if len(set(columns[name])) == 1 and (len(groups) > 1 or name != "method"):
             del columns[name]
     return format_table(list(columns), zip(*columns.values(), strict=True))
+
+
+def format_runs(cells: Sequence[str], interval: bool) -> str:
+    """Return the cell of some runs; with how many have the figure, where not all do."""
+    known = [float(cell) for cell in cells if cell]
+    count = f" ({len(known)})" if 0 < len(known) < len(cells) else ""
+    return format_cell(known, interval) + count
 
 
 def fill_page(text: str, rows: list[Row]) -> str:

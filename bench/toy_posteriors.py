@@ -172,7 +172,7 @@ def measure(name: str, options: Any, way: str) -> list[str]:
             masses.append(abs(belief.weights[near].sum() - posterior.mass))
     gaps = np.array(exact) - np.array(found)
     mass = np.mean(masses) if masses else None
-    correlation = float(torch.stack(off).mean(0).abs().max()) if off else None
+    correlation = float(torch.stack(off).abs().mean(0).max()) if off else None
     numbers = (np.mean(exact), gaps.mean(), gaps.max(), mass, correlation)
     cells = ["" if x is None else f"{x:.2f}" for x in numbers]
     shares = [f"{100 * share:.0f} %" for share in np.mean(held, 0)]

@@ -29,6 +29,7 @@ import math
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -256,8 +257,7 @@ def measure_sequence(
         [judge(([one[n] for n in shown], [0.0]), own) for one in results]
         for results in (tracks, others)
     )
-    truth = torch.from_numpy(np.stack([frame.truth[name] for frame in own]))
-    steps = measure_jitter(truth, torch.eye(4).double().expand_as(truth), model.center.double())
+    steps = measure_steps(frames, name, model.center.double())
     back = [find_recovery(one, frames, after) for one in tracks]
     cells = [name, sequence, *(f"{x:.1f}" for x in steps), str(len(frames)), str(len(covered))]
     cells += [average(single, "add"), average(scores, "add"), average(walks, "add")]
@@ -265,6 +265,20 @@ def measure_sequence(
     cells += [f"{np.mean([one.lost for one in scores]):.1f}"]
     cells += [f"{np.mean([sum(one[n].is_tracked for n in covered) for one in tracks]):.1f}"]
     return format_row([*cells, describe_recovery(back)])
+
+
+def measure_steps(
+    frames: Sequence[VideoFrame], name: str, center: torch.Tensor
+) -> tuple[float, float]:
+    """Return how far an object moves from one frame to the next, root mean square [mm], [degrees];
+    of frames that follow each other: a gap while it is covered is no step.
+    """
+    truths = [frame.truth.get(name) for frame in frames]
+    pairs = [(a, b) for a, b in pairwise(truths) if a is not None and b is not None]
+    still = torch.eye(4).double().expand(2, 4, 4)
+    steps = [measure_jitter(torch.from_numpy(np.stack(pair)), still, center) for pair in pairs]
+    shift, turn = np.sqrt(np.square(steps).mean(0))
+    return float(shift), float(turn)
 
 
 def find_recovery(
@@ -339,7 +353,7 @@ def run_together(options: argparse.Namespace, names: Sequence[str]) -> None:
     meshes = open_meshes(options.meshes, None, kind, names)
     loaded = {name: posefilter.load(name, device="cpu") for name in names}
     for folder in options.sequences or [options.frames]:
-        parts = {} if options.sequences else {"parts": ["data"]}
+        parts = {} if options.sequences else {"subsets": ["data"]}
         reader = open_reader(kind, folder, None if options.sequences else names, meshes, **parts)
         for one in list_scenes(reader):
             video = SceneVideo(reader, one, names)

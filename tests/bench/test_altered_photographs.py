@@ -130,3 +130,17 @@ def test_a_file_has_one_row_and_others_stay(altered: ModuleType, tmp_path: Path)
     assert lines[1].startswith("| b | w | 70.0 / 71.0 | – |")
     assert lines[1].endswith("| 1 of 4 |")
     assert len(lines) == 2
+
+
+def test_a_change_that_was_tested_twice_counts_once(altered: ModuleType, tmp_path: Path) -> None:
+    page = tmp_path / "page.md"
+    page.write_text(
+        "<!-- table: altered -->\n<!-- end -->\n<!-- table: sensors -->\n<!-- end -->\n"
+    )
+    row = {"object": "a", "weights": "as it ships", "change": "none", "images": 4}
+    old = row | {"add_auc": 50.0, "add_s_auc": 60.0, "found_wrong": 2}
+    new = row | {"add_auc": 90.0, "add_s_auc": 95.0, "found_wrong": 1}
+    altered.write_table([old, new], page)
+    line = next(one for one in page.read_text().splitlines() if one.startswith("| a "))
+    assert "90.0 / 95.0" in line
+    assert line.endswith("| 1 of 4 |")

@@ -50,6 +50,14 @@ def test_every_kind_of_training_composes(run: Any, tmp_path: Path) -> None:
     assert job.choices["model"] == run.model
 
 
+@pytest.mark.parametrize("name", ["mustard_d", "sugar_v", "banana_x", "tuna_y"])
+def test_renders_are_tested_on_by_the_split_that_no_training_has_seen(name: str) -> None:
+    run = next(one for one in photograph_runs.plan() if one.name == name)
+    _, renders = photographs.evaluate_commands(run, Path("root"), "meshes", "frames")
+    assert photograph_runs.SPLIT in renders
+    assert "data.root=root/data" in renders
+
+
 def test_a_warm_start_comes_after_the_run_that_it_starts_from() -> None:
     done = []
     for run in photograph_runs.plan():

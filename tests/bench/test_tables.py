@@ -36,6 +36,13 @@ def test_seeds_become_one_row_with_their_standard_deviation(tables: ModuleType) 
     assert single.endswith("– |")
 
 
+def test_a_figure_that_some_seeds_lack_says_how_many_have_it(tables: ModuleType) -> None:
+    rows = [make_row(seed=seed, auc=value) for seed, value in enumerate([10.0, 12.0, 17.0])]
+    rows[1]["auc"] = ""
+    *_, row = tables.make_table(rows, ["auc"]).splitlines()
+    assert row.split("|")[-2].strip() == "13.5 ± 4.9 (2)"
+
+
 def test_an_interval_covers_the_mean_as_students_t_says(tables: ModuleType) -> None:
     rows = [make_row(seed=seed, auc=value) for seed, value in enumerate([10.0, 12.0, 17.0])]
     page = "<!-- runs table=t show=auc spread=interval -->\n<!-- end -->"
