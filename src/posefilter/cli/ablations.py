@@ -228,8 +228,8 @@ POSE_SPACE_ABLATIONS = (
 ABLATIONS = (*IMAGE_SPACE_ABLATIONS, *POSE_SPACE_ABLATIONS)
 
 # Left out of the detectors' sweep: s5_position equals paper (a whole-pixel glimpse has no gradient
-# through its position), so s9 equals s4; s3, s6 and s8 say nothing about a detector; from
-# c3_bounded to c5_displacement_loss the gradient of 30 steps overflows.
+# through its position), so s9 equals s4; s8 resamples by a likelihood that no loss trains; s3 and
+# s6 were not run; from c3_bounded to c5_displacement_loss the gradient of 30 steps overflows.
 _NOT_OF_DETECTORS = (
     "s3_balanced", "s5_position", "s6_informed", "s8_resample", "s9_displacement_loss_and_position",
     "c3_bounded", "c4_balanced", "c5_displacement_loss",
