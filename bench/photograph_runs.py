@@ -38,10 +38,13 @@ THIRD, TRAIN_SPLIT = "data_third", "data.split={train: 0.93, val: 0.05, test: 0.
 FOURTH = "data_fourth"
 # a fifth, of other seeds
 FIFTH = "data_fifth"
-# a sixth, of few objects and more frames of each, with the seed and the number of frames of each
+# a sixth, of few objects and more frames of each: the seed, the frames, and the steps of each
 SIXTH = "data_sixth"
 SIXTH_SPLIT = "data.split={train: 0.96, val: 0.02, test: 0.02}"
-SIXTH_FRAMES = {"mustard": (2006, 2800), "tuna": (2007, 2800)}
+SIXTH_RUNS = {
+    "mustard": (2006, 2800, 7000), "tuna": (2007, 2800, 7000),
+    "chef": (2002, 2000, 4000), "gelatin": (2009, 2000, 4000),
+}  # fmt: skip
 
 
 class Run(NamedTuple):
@@ -204,12 +207,13 @@ def plan() -> list[Run]:
         words = f"{last.words.replace('=camera ', '=camera_magnified ')} {sized}"
         judged.append(last._replace(words=words, scenes=FIFTH))
     # of the sixth set, for longer; the checkpoint that ships is the last
-    sized = f"{_STEPS}.1.object_size_probability=0.25 trainer.val_check_interval=3500"
+    sized = f"{_STEPS}.1.object_size_probability=0.25"
     tested = "data.min_visibility_test=0.1 data.limit_val=48 data.limit_test=2"
-    for name in SIXTH_FRAMES:
-        last = shipped(f"{name}_y", 7000)
+    for name, (_, _, count) in SIXTH_RUNS.items():
+        last = shipped(f"{name}_y", count)
         words = last.words.replace(short, f"data/augment=camera_magnified {tested}")
-        judged.append(last._replace(words=f"{words} {sized}", scenes=SIXTH))
+        words = f"{words} {sized} trainer.val_check_interval={count if count < 7000 else 3500}"
+        judged.append(last._replace(words=words, scenes=SIXTH))
     return [*map(_without_surface, earlier), *judged]
 
 

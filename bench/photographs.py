@@ -27,7 +27,7 @@ from photograph_runs import (
     FOURTH,
     OBJECTS,
     SIXTH,
-    SIXTH_FRAMES,
+    SIXTH_RUNS,
     SIXTH_SPLIT,
     SPLIT,
     TARGETS,
@@ -83,7 +83,7 @@ def list_sets(root: Path) -> list[list[list[str]]]:
     fifth = render_commands(root, 400, FIFTH, 501, "different")
     sixth = [
         render_command(root / SIXTH / OBJECTS[name], OBJECTS[name], seed, frames, "different", root)
-        for name, (seed, frames) in SIXTH_FRAMES.items()
+        for name, (seed, frames, _) in SIXTH_RUNS.items()
     ]
     return [render_commands(root), third, fourth, fifth, sixth]
 
