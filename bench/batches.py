@@ -28,6 +28,8 @@ from posefilter.memory import keep_freed_memory
 from posefilter.nets.layers import fast_bfloat16
 
 PAGE = HOME / "docs" / "performance.md"
+# options whose defaults the table is of
+OF_THE_TABLE = ("only", "weights", "overrides", "threads", "size")
 HEAD = (
     "threads", "images in a call", "an image, ms", "CPU ms", "throughput over single images",
     "GFLOP an image", "GFLOP a CPU second", "peak", "share of the peak",
@@ -114,9 +116,6 @@ def measure(
     return rows
 
 
-OF_THE_TABLE = ("only", "weights", "overrides", "threads", "size")
-
-
 def main() -> None:
     """Measure, print and write."""
     parser = make_parser(__doc__)
@@ -144,7 +143,6 @@ def main() -> None:
     rows = []
     for threads in options.threads:
         rows += measure(estimator, frames, threads, options.rounds)
-    # the table is of the defaults
     changed = [name for name in OF_THE_TABLE if getattr(options, name) != parser.get_default(name)]
     if not changed:
         PAGE.write_text(put_table(PAGE.read_text(), "batches", HEAD, rows))

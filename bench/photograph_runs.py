@@ -206,7 +206,8 @@ def plan() -> list[Run]:
         last = shipped(f"{name}_x", 1500)
         words = f"{last.words.replace('=camera ', '=camera_magnified ')} {sized}"
         judged.append(last._replace(words=words, scenes=FIFTH))
-    # of the sixth set, for longer; the checkpoint that ships is the last
+    # of the sixth set, for longer, validated at the end, and the longest half way, too; the
+    # checkpoint that ships is the last
     sized = f"{_STEPS}.1.object_size_probability=0.25"
     tested = "data.min_visibility_test=0.1 data.limit_val=48 data.limit_test=2"
     for name, (_, _, count) in SIXTH_RUNS.items():

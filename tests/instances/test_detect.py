@@ -265,8 +265,8 @@ def test_an_answer_that_is_surplus_in_the_end_does_not_hide_another_class() -> N
 
     def assess(trace: Trace, batch: Batch) -> Assessment:
         u = trace.belief.best[0, 0, 3] > 0  # where the first class has its second answer
-        said = torch.tensor([0.97 if u else 0.6]).double()
-        return Assessment(said, said)
+        sure = torch.tensor([0.97 if u else 0.6]).double()
+        return Assessment(sure, sure)
 
     first.assess = assess  # type: ignore[method-assign]
     found = run([first, second], [1, 1], image)
@@ -279,8 +279,8 @@ def test_the_verdict_goes_by_a_tolerance_where_one_is_given() -> None:
 
     class Turned(Toy):
         def assess(self, trace: Trace, batch: Batch) -> Assessment:
-            said = torch.tensor([0.95, 0.5]).double()
-            return Assessment(said[:1], said[1:], {"a": said[:1]})
+            presence, right = torch.tensor([[0.95], [0.5]]).double()
+            return Assessment(presence, right, {"a": presence})
 
     class Calibrated:
         def assess(self, values: Any, tolerance: PoseTolerance) -> Assessment:

@@ -54,12 +54,12 @@ HOSTILE = {
 
 @pytest.mark.parametrize("what", HOSTILE)
 def test_it_is_refused_before_it_is_obeyed(what: str) -> None:
-    value, told = HOSTILE[what]
+    value, expected = HOSTILE[what]
     if what == "a type of numbers, called":  # Python refuses to write it
         data = b"\x80\x02ctorch\nfloat32\nK\x01\x85R."
     else:
         data = pickle.dumps({"x": value}, 2)
-    with pytest.raises(UserError, match=told):
+    with pytest.raises(UserError, match=expected):
         check_pickle(data)
 
 

@@ -131,7 +131,7 @@ def resolve(found: Sequence[Detection], counts: Sequence[int] | None = None) -> 
         if len(best) == len(out):
             return out
         # the first that is one too many: without it others may keep theirs
-        excess = next(one for i, one in enumerate(out) if i >= len(best) or best[i] is not one)
+        excess = next(one for one in out if not any(one is each for each in best))
         order = [one for one in order if one.visible is not excess.visible]
 
 
