@@ -285,7 +285,8 @@ def gather_frames(rows: Sequence[Row], leave_out: Sequence[str]) -> Frames:
     nonconformity = np.array([row.get("nonconformity", np.nan) for row in rows])
     known = all("errors" in row for row in rows)  # not in rows of earlier versions
     errors = PoseErrors(*np.array([row["errors"] for row in rows]).T) if known else None
-    return Frames(names, values, there, right, nonconformity, errors)
+    visibility = np.array([row.get("visibility", np.nan) for row in rows])
+    return Frames(names, values, there, right, nonconformity, errors, visibility)
 
 
 def share(hits: Sequence[Any]) -> str:

@@ -1,6 +1,7 @@
 """Conformal sets hold the truth as often as they guarantee, in each group, whatever the belief."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -54,6 +55,49 @@ def test_the_limit_is_the_order_statistic_of_the_definition() -> None:
     assert found.find_limit(0.0, 0.1) == 1
     assert found.find_group(math.nan) == 0
     assert Conformal((), ((),)).find_limit(0.1, 0.5) == math.inf
+
+
+def test_occluded_frames_raise_the_limit_where_they_are_enough_for_the_level() -> None:
+    own = tuple(float(x) for x in range(1, 20))
+    occluded = (12.0, 13.0, 14.0, 15.0, 16.0)
+    found = Conformal((), (own,), "probability", (occluded,))
+    assert found.find_limit(0.5, 0.3) == 14  # ceil(0.5 x 6), above 10
+    assert found.find_limit(0.8, 0.3) == 16  # as the group's own
+    assert found.find_limit(0.9, 0.3) == 18  # the sixth of five: the group's own limit alone
+    assert replace(found, occluded=(occluded[1:],)).find_limit(0.5, 0.3) == 10  # four are too few
+    easy = (-9.0, -8.0, -7.0, -6.0, -5.0)
+    assert replace(found, occluded=(easy,)).find_limit(0.5, 0.3) == 10  # never a smaller set
+
+
+def test_frames_of_unknown_visibility_are_not_occluded() -> None:
+    seen = np.array([0.1, math.nan, 0.25, 0.2])
+    found = fit_conformal(np.array([4.0, 3.0, 2.0, 1.0]), np.full(4, 0.5), (), "surface", seen)
+    assert found.occluded == ((1.0, 4.0),)
+    assert found.scores == ((1.0, 2.0, 3.0, 4.0),)
+    assert fit_conformal(np.zeros(4), np.full(4, 0.5), ()).occluded == ()
+
+
+@pytest.mark.parametrize("level", [0.5, 0.8])
+def test_sets_hold_the_truth_of_occluded_frames_that_the_probability_does_not_tell(
+    level: float,
+) -> None:
+    """Of a group's frames a fifth are harder, and nothing that a new frame shows says which."""
+    rng = np.random.default_rng(5)
+    covered: dict[bool, dict[bool, list[bool]]] = {
+        known: {True: [], False: []} for known in (True, False)
+    }
+    for _ in range(300):
+        seen = rng.choice([0.1, 0.9], size=161, p=[0.2, 0.8])
+        scores = rng.normal(size=161) + np.where(seen < 0.25, 3.0, 0.0)
+        for known, own in covered.items():
+            values = np.full(160, 0.5)
+            visibility = seen[1:] if known else None
+            found = fit_conformal(scores[1:], values, (), "probability", visibility)
+            hit = bool(scores[0] <= found.find_limit(level, 0.5))
+            own[bool(seen[0] < 0.25)].append(hit)
+    assert np.mean(covered[False][True]) < level - 0.2
+    assert np.mean(covered[True][True]) > level - 0.1
+    assert np.mean(covered[True][False]) >= level
 
 
 def model(symmetries: torch.Tensor | None = None) -> ObjectModel:
@@ -122,6 +166,7 @@ def frames(count: int = 60) -> Frames:
         there,
         there & (rng.random(count) < 0.5),
         nonconformity,
+        visibility=np.where(there, rng.random(count), np.nan),
     )
 
 
@@ -133,6 +178,10 @@ def test_a_calibration_carries_the_scores_of_the_frames_with_the_object() -> Non
     together = sorted(x for group in made.conformal.scores for x in group)
     assert together == sorted(own.nonconformity[own.present].tolist())  # type: ignore[index]
     assert read_calibration(made.to_plain(), "x") == made
+    occluded = sorted(x for group in made.conformal.occluded for x in group)
+    assert own.visibility is not None
+    assert occluded == sorted(own.nonconformity[own.visibility < 0.25].tolist())  # type: ignore[index]
+    assert occluded
     earlier = made.to_plain()
     del earlier["conformal"]
     assert read_calibration(earlier, "x").conformal is None
@@ -203,6 +252,9 @@ def test_few_frames_are_one_group() -> None:
         {"edges": [], "scores": [[1.0]], "by": "score"},
         {"edges": [], "scores": [[1.0]], "by": []},
         {"edges": [], "scores": [[1.0]], "more": 1},
+        {"edges": [], "scores": [[1.0]], "occluded": [[1.0], []]},
+        {"edges": [], "scores": [[1.0]], "occluded": [[2.0, 1.0]]},
+        {"edges": [], "scores": [[1.0]], "occluded": 1},
     ],
 )
 def test_scores_that_are_none_are_refused(wrong: object) -> None:

@@ -228,7 +228,7 @@ def test_what_is_not_finite_is_calibrated_with_and_read_again() -> None:
     off = [np.where(there, rng.uniform(0, 0.2, 60), np.nan) for _ in range(4)]
     for one in off:
         one[5] = math.inf
-    frames = make_frames(values, [there], [PoseErrors(*off)])
+    frames = make_frames(values, [there], [PoseErrors(*off)], [np.full(len(there), 0.5)])
     assert not frames.correct[5]
     made = fit_calibration(frames, "fat")
     assert read_calibration(made.to_plain(), "x") == made

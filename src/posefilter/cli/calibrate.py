@@ -31,6 +31,7 @@ from posefilter.confidence.belief_scale import (
     measure_spread,
 )
 from posefilter.confidence.calibration import Assessment, Calibration
+from posefilter.confidence.conformal import LITTLE_VISIBLE
 from posefilter.confidence.fit import (
     FEWEST,
     Frames,
@@ -162,7 +163,7 @@ def collect_frames(
         first_answers: Those of an earlier call with the same frames, which are not searched for
             again: estimates, and the draws of other searches, stay what they would be.
     """
-    values, there, errors, beliefs, answers = [], [], [], [], []
+    values, there, errors, visibility, beliefs, answers = [], [], [], [], [], []
     parts = [(one, True) for one in present] + [(one, False) for one in absent]
     loaders = [(make_loader(one, _BATCH, 0), is_there) for one, is_there in parts]
     count = sum(len(loader) for loader, _ in loaders)
@@ -185,14 +186,17 @@ def collect_frames(
             trace = look_again(method, trace, seen, generator)
             values.append(method.collect_features(trace, seen))
         there.append(np.full(len(truth), is_there))
-        off = PoseErrors(*[np.full(len(truth), np.nan)] * 4)
+        unknown = np.full(len(truth), np.nan)
+        off = PoseErrors(*[unknown] * 4)
+        visibility.append(batch.visibility.double().numpy() if is_there else unknown)
         if is_there:
             measured = measure_pose_errors(trace.belief.best.cpu(), truth, method.object_model)
             off = PoseErrors(*(part.double().numpy() for part in measured))
             beliefs.append((*(part.cpu() for part in trace.belief), truth))
         errors.append(off)
     *own, truths = (torch.cat(parts) for parts in zip(*beliefs, strict=True))
-    return make_frames(values, there, errors), Beliefs(BeliefBatch(*own), truths), answers
+    frames = make_frames(values, there, errors, visibility)
+    return frames, Beliefs(BeliefBatch(*own), truths), answers
 
 
 def _report_progress(items: Iterable[_Item], count: int, console: str) -> Iterator[_Item]:
@@ -333,6 +337,9 @@ def tell(job: Job, method: PoseEstimator, calibration: Calibration, out: Path) -
     if calibration.conformal is not None:
         shown = " and ".join(str(len(own)) for own in calibration.conformal.scores)
         rows.append(("groups of those with it, by rising probability", shown))
+    if calibration.conformal is not None and calibration.conformal.occluded:
+        shown = " and ".join(str(len(own)) for own in calibration.conformal.occluded)
+        rows.append((f"of these, visibility below {LITTLE_VISIBLE}", shown))
     few = f"that of the particles: fewer than {FEWEST_RIGHT} estimates are right"
     width = f"learned from {counts['right']} right estimates"
     rows.append(("width of a belief", few if calibration.belief_scale is None else width))

@@ -337,7 +337,7 @@ def _errors(content: Any, count: int) -> CalibrationErrors:
 def _conformal(content: Any) -> Conformal:
     if isinstance(content, dict) and "surprises" in content:  # the name in earlier versions
         content = {"scores" if key == "surprises" else key: x for key, x in content.items()}
-    if not isinstance(content, dict) or set(content) - {"by"} != {"edges", "scores"}:
+    if not isinstance(content, dict) or set(content) - {"by", "occluded"} != {"edges", "scores"}:
         raise ValueError("should have edges and scores in conformal")
     by = content.get("by", "surface")  # earlier versions name none
     if by not in GROUPED_BY:
@@ -346,14 +346,26 @@ def _conformal(content: Any) -> Conformal:
     if not isinstance(groups, list) or not 1 <= len(groups) <= _MOST_GROUPS:
         raise ValueError(f"should have 1 to {_MOST_GROUPS} groups in conformal")
     edges = _numbers(content["edges"], len(groups) - 1, "conformal's edges")
+    scores = _score_groups(groups)
+    occluded = _score_groups(content.get("occluded", []))  # earlier versions have none
+    if len(occluded) not in (0, len(scores)):
+        raise ValueError(f"should have {len(scores)} groups of occluded frames in conformal")
+    if list(edges) != sorted(edges):
+        raise ValueError("has numbers of conformal that do not rise")
+    return Conformal(edges, scores, by, occluded)
+
+
+def _score_groups(groups: Any) -> tuple[tuple[float, ...], ...]:
+    if not isinstance(groups, list):
+        raise ValueError("has groups of conformal that are none")
     read = []
     for one in groups:
         if not isinstance(one, list) or len(one) > _MOST_SCORES:
             raise ValueError("has a group of conformal that is none")
         read.append(_numbers(one, len(one), "conformal's scores"))
-    if any(list(one) != sorted(one) for one in [edges, *read]):
-        raise ValueError("has numbers of conformal that do not rise")
-    return Conformal(edges, tuple(read), by)
+        if one != sorted(one):
+            raise ValueError("has numbers of conformal that do not rise")
+    return tuple(read)
 
 
 def _numbers(

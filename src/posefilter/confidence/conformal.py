@@ -16,9 +16,17 @@ regression, so that the guarantee holds nearly, not exactly: see docs/results/co
 what was measured.  Calibrations of before have two groups, by the feature `surface` at a fixed
 limit.
 
+Little of the object visible is harder than the probability shows, and a new frame's visibility is
+not known. A group that has enough calibration frames with less than a quarter visible therefore
+takes the larger of two limits, its own and that of these frames alone: whichever kind the new frame
+is of, its set holds the truth with a probability of at least p (the idea of Barber et al. 2021, who
+take the largest over all large subsets; here over two).
+
 References:
     Vovk, Gammerman, Shafer: Algorithmic Learning in a Random World. Springer (2005).
     Vovk: Cross-conformal predictors. Annals of Mathematics and Artificial Intelligence 74 (2015).
+    Barber, Candes, Ramdas, Tibshirani: The limits of distribution-free conditional predictive
+        inference. Information and Inference 10 (2021).
 """
 
 import bisect
@@ -35,6 +43,8 @@ _FEWEST = 20  # frames of a group: with as many, a set of 95 % is not that of al
 # of the frames, below each limit between groups: the surest are much alike, the others are not
 _SHARES = (0.1, 0.25, 0.45, 0.7)
 _EVEN = 4  # groups at most where frames are too few for these
+LITTLE_VISIBLE = 0.25  # a frame with less counts for the second limit of its group
+_FEWEST_OCCLUDED = 5  # frames of a group that a second limit takes at least
 # of the feature `surface`: about half of an object's surface faces the camera, so that below a
 # quarter the depth shows less than half of what could be seen
 EDGES = (0.25,)
@@ -48,11 +58,14 @@ class Conformal:
         edges: Limits between groups, of the feature `surface` or of the probability, rising.
         scores: Of each group, in rising order [nat]; one group more than there are edges.
         by: What the groups are told apart by.
+        occluded: Those scores of each group whose frames show less than LITTLE_VISIBLE of the
+            object, in rising order [nat]; empty: of an earlier version, or not known.
     """
 
     edges: tuple[float, ...]
     scores: tuple[tuple[float, ...], ...]
     by: By = "surface"
+    occluded: tuple[tuple[float, ...], ...] = ()
 
     def find_group(self, value: float) -> int:
         """Return the group of a frame by its feature or probability; NaN is in the first."""
@@ -66,11 +79,22 @@ class Conformal:
             value: Of the frame: its probability, or its feature `surface`; see `by`.
 
         Returns:
-            The limit [nat]; infinite where the group's frames are too few for the level.
+            The limit [nat]; infinite where the group's frames are too few for the level. Its
+            occluded frames count where they are enough for the level.
         """
-        own = self.scores[self.find_group(value)]
-        rank = math.ceil(round(level * (len(own) + 1), 9))
-        return math.inf if rank > len(own) or not own else own[max(rank, 1) - 1]
+        group = self.find_group(value)
+        limit = _find_quantile(self.scores[group], level)
+        occluded = self.occluded[group] if self.occluded else ()
+        if len(occluded) < _FEWEST_OCCLUDED:
+            return limit
+        second = _find_quantile(occluded, level)
+        return limit if math.isinf(second) else max(limit, second)
+
+
+def _find_quantile(scores: Sequence[float], level: float) -> float:
+    """Return the ceil(level (n + 1))-th of n scores in rising order; infinite if there is none."""
+    rank = math.ceil(round(level * (len(scores) + 1), 9))
+    return math.inf if rank > len(scores) or not scores else scores[max(rank, 1) - 1]
 
 
 def choose_edges(probability: np.ndarray) -> tuple[float, ...]:
@@ -88,7 +112,11 @@ def choose_edges(probability: np.ndarray) -> tuple[float, ...]:
 
 
 def fit_conformal(
-    scores: np.ndarray, values: np.ndarray, edges: Sequence[float] = EDGES, by: By = "surface"
+    scores: np.ndarray,
+    values: np.ndarray,
+    edges: Sequence[float] = EDGES,
+    by: By = "surface",
+    visibility: np.ndarray | None = None,
 ) -> Conformal:
     """Sort the nonconformity scores of calibration frames into groups.
 
@@ -97,8 +125,16 @@ def fit_conformal(
         values: (n,) that feature of the frames, or probabilities.
         edges: Limits between groups, chosen without looking at the scores.
         by: What the values are.
+        visibility: (n,) of the object in the frames; NaN where it is not known. None: of no frame.
     """
     empty = Conformal(tuple(edges), ((),) * (len(edges) + 1))
     group = np.array([empty.find_group(float(one)) for one in values], dtype=int)
-    own = [np.sort(scores[group == k]).tolist() for k in range(len(edges) + 1)]
-    return Conformal(empty.edges, tuple(tuple(one) for one in own), by)
+
+    def sort(some: np.ndarray) -> tuple[tuple[float, ...], ...]:
+        own = (np.sort(scores[some & (group == k)]) for k in range(len(edges) + 1))
+        return tuple(tuple(one.tolist()) for one in own)
+
+    whole = sort(np.ones(len(scores), dtype=bool))
+    known = visibility is not None
+    occluded = sort(np.asarray(visibility) < LITTLE_VISIBLE) if known else ()
+    return Conformal(empty.edges, whole, by, occluded)

@@ -33,29 +33,35 @@ class Frames(NamedTuple):
     nonconformity: np.ndarray | None = None
     # of (n,) each, NaN where the object is not in the image; None: not measured
     errors: PoseErrors | None = None
+    # (n,) share of the object that is visible, NaN where it is not in the image or not known; None:
+    # not measured
+    visibility: np.ndarray | None = None
 
     def select(self, index: np.ndarray) -> "Frames":
         """Return some of the frames."""
-        nonconformity = None if self.nonconformity is None else self.nonconformity[index]
+        nonconformity, visibility = (
+            None if one is None else one[index] for one in (self.nonconformity, self.visibility)
+        )
         errors = None if self.errors is None else PoseErrors(*(x[index] for x in self.errors))
         own = (self.values[index], self.present[index], self.correct[index])
-        return Frames(self.features, *own, nonconformity, errors)
+        return Frames(self.features, *own, nonconformity, errors, visibility)
 
 
 def make_frames(
     values: Sequence[Mapping[str, torch.Tensor]],
     present: Sequence[np.ndarray],
     errors: Sequence[PoseErrors],
+    visibility: Sequence[np.ndarray],
 ) -> Frames:
-    """Return the frames of batches of features, each (B,) by name; errors are NaN where the object
-    is not in the image.
+    """Return the frames of batches of features, each (B,) by name; errors and visibility are NaN
+    where the object is not in the image.
     """
     names = tuple(values[0])
     rows = [np.stack([one[name].double().cpu().numpy() for name in names], 1) for one in values]
     all_rows, seen = (np.concatenate(one) for one in (rows, present))
     all_rows[~np.isfinite(all_rows)] = np.nan  # no number
     off = PoseErrors(*(np.concatenate(parts) for parts in zip(*errors, strict=True)))
-    return Frames(names, all_rows, seen, RIGHT.accepts(off), None, off)
+    return Frames(names, all_rows, seen, RIGHT.accepts(off), None, off, np.concatenate(visibility))
 
 
 def fit_choice(frames: Frames, source: str) -> Calibration:
@@ -113,7 +119,10 @@ def fit_calibration(
         return fitted
     own = frames.present
     held = cross_validate(frames, first=first).probability.numpy()[own]
-    sets = fit_conformal(frames.nonconformity[own], held, choose_edges(held), by="probability")
+    visibility = None if frames.visibility is None else frames.visibility[own]
+    sets = fit_conformal(
+        frames.nonconformity[own], held, choose_edges(held), "probability", visibility
+    )
     return replace(fitted, conformal=sets)
 
 
