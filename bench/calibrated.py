@@ -1,7 +1,7 @@
 """Test what calibrated checkpoints say of themselves, on rendered frames that no calibration saw.
 
     python bench/calibrated.py --root DIR --meshes DIR --rows FILE.jsonl [--frames 200]
-        [--without 100] [--minutes 5] FILE.ckpt ...
+        [--without 100] [--max-visibility 0.25] [--minutes 5] FILE.ckpt ...
     python bench/calibrated.py --table FILE.jsonl      # only prints the tables
     python bench/calibrated.py --cross FILE.jsonl [--most 80] [--leave-out score]
         [--tolerance add_s=0.1 translation_mm=5]  # the same, of calibrations on these frames
@@ -12,10 +12,11 @@ so many of their frames with the object and as many without, --leave-out leaves 
 With --tolerance a pose is right that keeps it (`posefilter.PoseTolerance`), and the probability is
 that of it.
 
-Every frame below --root is taken, in a fixed shuffle: --frames with a visibility above 0.1, and
---without that lack the object.  A row an image is added to the file; started again, it goes on, and
---minutes ends it early.  What the filter leaves is kept in FILE.beliefs: without the rows, they are
-judged anew in a fraction of the time, by other calibrations of the same filter.
+Every frame below --root is taken, in a fixed shuffle: --frames with a visibility above 0.1, of
+these with --max-visibility only those that show less, and --without that lack the object. A row an
+image is added to the file; started again, it goes on, and --minutes ends it early. What the filter
+leaves is kept in FILE.beliefs: without the rows, they are judged anew in a fraction of the time, by
+other calibrations of the same filter.
 
 Shown is the share of the object that is seen: the visible share of what lies in the frame, times
 the share of its surface points that the frame holds, since the frame cuts many off.  Coverage is
@@ -25,6 +26,7 @@ whose estimate is right: ellipsoids are of the belief's covariance about the est
 of Student's t.
 """
 
+import itertools
 import json
 import math
 import sys
@@ -202,7 +204,12 @@ def collect(file: str, options: Any, end: float) -> bool:
     store = options.rows.with_suffix(".beliefs")
     store.mkdir(parents=True, exist_ok=True)
     data = open_frames(file, checkpoint, name, options)
-    parts = ((data.val_dataset, True), (data.absent_dataset("val", options.without), False))
+    shown, absent = data.val_dataset, data.absent_dataset("val", options.without)
+    if options.max_visibility < math.inf:
+        shares = (float(shown[i].visibility) for i in range(len(shown)))
+        few = [share < options.max_visibility for share in shares]
+        shown.records = list(itertools.compress(shown.records, few))
+    parts = ((shown, True), (absent, False))
     for dataset, there in parts:
         done = sum(row["object"] == name and row["there"] == there for row in rows)
         for number, batch in enumerate(make_loader(dataset, 8, 0)):
@@ -398,6 +405,7 @@ def main() -> int:
     parser.add_argument("--rows", type=Path)
     parser.add_argument("--frames", type=int, default=200)
     parser.add_argument("--without", type=int, default=100)
+    parser.add_argument("--max-visibility", type=float, default=math.inf)
     parser.add_argument("--minutes", type=float, default=60.0)
     parser.add_argument("--table", type=Path, help="only print the tables of these rows")
     parser.add_argument("--cross", type=Path, help="the same, of calibrations on these rows")
