@@ -57,6 +57,7 @@ SMALL_BOXES = (
     "model.net.width=16 callbacks=checkpoints"
 )
 SMALL_BOX = SMALL_BOXES.format("downsized", "paper")
+BOX_RUN = "ablation_pose_pf_box/ablation={},*seed={},*"
 POSE = "model=pose_pf data/augment=strong seed=0"  # its row is of the default of that time
 # no loss on a part: the pose's head has no fragments, whose choice passes no gradient
 END_TO_END = (
@@ -174,7 +175,28 @@ def plan(meshes: str | None = None, frames: str | None = None) -> list[Line]:
         runs["pose_pf"] = SHIPPED
         lines += [Line("real_frames", real, run, model) for model, run in runs.items()]
     if meshes:
-        lines += list_other_objects(meshes, frames)
+        lines += [*list_other_objects(meshes, frames), *list_pose_on_photographs(meshes, frames)]
+    return lines
+
+
+def list_pose_on_photographs(meshes: str, frames: str | None) -> list[Line]:
+    """Return the ablations of pose_pf on renders of the real cracker box, with the augmentation
+    that imitates a camera, and on the photographs that show it.
+    """
+    box = "data.object=003_cracker_box data.root=outputs/data/003_cracker_box_small"
+    at = f"{box} data.meshes={meshes} data/augment=camera"
+    lines = [
+        line._replace(table="ablation_pose_pf_box", words=f"{line.words} {at}")
+        for seed in range(3)
+        for line in list_pose_rows(f"seed={seed}")
+    ]
+    if frames:
+        real = f"data=ycb_video data.root={frames} data.meshes={meshes}"
+        lines += [
+            Line("ablation_pose_pf_frames", real, BOX_RUN.format(name, seed), f"{name}/{seed}")
+            for name in list_pose_space_ablations()
+            for seed in range(3)
+        ]
     return lines
 
 
