@@ -164,7 +164,7 @@ def test_the_worst_and_the_best_of_the_test_are_drawn(tested: tuple[Path, PoseEr
 def test_a_selection_keeps_the_extremes_whatever_their_order() -> None:
     kept = ImageSelection(first=1, best=2, worst=2)
     for error in (0.3, 0.1, 0.5, 0.2, 0.4):
-        image = KeptImage(0, "", error, *(np.zeros(0),) * 6)
+        image = KeptImage(0, "", error, False, *(np.zeros(0),) * 6)
         kept.offer(error, lambda image=image: image)  # type: ignore[misc]
     found = {name: [one.error for one in images] for name, images in kept.kept.items()}
     assert found == {"first": [0.3], "best": [0.1, 0.2], "worst": [0.5, 0.4]}
@@ -175,7 +175,7 @@ def test_an_image_is_among_the_best_or_among_the_worst(best: float) -> None:
     """Of fewer images than both take, each is drawn once."""
     kept = ImageSelection(first=9, best=2, worst=3)
     for error in (0.3, best, 0.2):
-        image = KeptImage(0, "", error, *(np.zeros(0),) * 6)
+        image = KeptImage(0, "", error, False, *(np.zeros(0),) * 6)
         kept.offer(error, lambda image=image: image)  # type: ignore[misc]
     chosen = kept.separate()
     found = {name: [one.error for one in images] for name, images in chosen.items()}

@@ -119,3 +119,13 @@ def test_color_that_is_no_image_is_not_advised_what_depth_is(name: str, tmp_path
         (np.save if name == "a.npy" else np.savez)(path, np.zeros((4, 4, 3), np.uint8))
     with pytest.raises(BadData, match=r"color is read of images alone.*\(save a PNG\)"):
         read_color(path)
+
+
+@pytest.mark.parametrize("form", ["PNG", "TIFF", "WEBP"])
+def test_alpha_is_dropped_and_not_multiplied_with(form: str, tmp_path: Path) -> None:
+    picture = np.full((8, 8, 4), 200, np.uint8)
+    picture[:4, :, 3], picture[4:, :, 3] = 128, 1
+    path = tmp_path / f"a.{form.lower()}"
+    options = {"lossless": True, "exact": True} if form == "WEBP" else {}
+    Image.fromarray(picture).save(path, form, **options)
+    np.testing.assert_array_equal(read_color(path), picture[..., :3])

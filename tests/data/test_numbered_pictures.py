@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from posefilter.data.sequences import FolderVideo
-from posefilter.errors import UserError
+from posefilter.errors import BadData, UserError
 
 
 @pytest.mark.parametrize(
@@ -148,3 +148,43 @@ def test_a_distortion_that_no_lens_has_is_named(tmp_path: Path) -> None:
     assert FolderVideo(tmp_path, K, 1000.0, distortion=(0.1, 0, 0, 0)).read(0).depth.any()
     with pytest.raises(UserError, match=r"^distortion=50,0,0,0: without it, .* % of the depth is"):
         FolderVideo(tmp_path, K, 1000.0, distortion=(50, 0, 0, 0)).read(0)
+
+
+def write_pair(folder: Path, name: str, depth_name: str, size: tuple[int, int]) -> None:
+    """Write a color picture and its depth, whole numbers or floats by the name's ending."""
+    for sub in ("rgb", "depth"):
+        (folder / sub).mkdir(exist_ok=True)
+    cv2.imwrite(str(folder / "rgb" / name), np.zeros((*size, 3), np.uint8))
+    whole = np.full(size, 800, np.uint16)
+    path = folder / "depth" / depth_name
+    if path.suffix == ".npy":
+        np.save(path, whole / np.float32(1000))
+    else:
+        cv2.imwrite(str(path), whole)
+
+
+@pytest.mark.parametrize(
+    ("depth", "meters"), [("0.png", False), ("0.tif", False), ("0.pgm", False), ("0.npy", True)]
+)
+def test_depth_is_in_meters_by_its_content_and_not_by_its_name(
+    depth: str, meters: bool, tmp_path: Path
+) -> None:
+    write_pair(tmp_path, "0.png", depth, (4, 4))
+    assert FolderVideo(tmp_path, np.eye(3), 1000.0).holds_meters is meters
+
+
+def test_the_size_is_that_of_most_pictures_and_not_of_the_first(tmp_path: Path) -> None:
+    for number, size in enumerate([(3, 4), (12, 16), (12, 16), (12, 16)]):
+        write_pair(tmp_path, f"{number}.png", f"{number}.png", size)
+    video = FolderVideo(tmp_path, np.eye(3), 1000.0)
+    with pytest.raises(BadData, match=r"0\.png: wrong image size \(4x3, but 1\.png says 16x12\)"):
+        video.read(0)
+    assert [video.read(number).rgb.shape for number in (1, 2, 3)] == [(12, 16, 3)] * 3
+
+
+def test_a_video_of_the_folder_one_stands_in_has_its_name(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write_pair(tmp_path, "0.png", "0.png", (4, 4))
+    monkeypatch.chdir(tmp_path)
+    assert FolderVideo(Path(), np.eye(3), 1000.0).name == tmp_path.name

@@ -43,6 +43,15 @@ def test_what_is_absent_is_named_and_not_drawn() -> None:
     assert (picture[480:] == draw_row(640, "absent: 003_cracker_box, 025_mug")).all()
 
 
+def test_a_long_caption_is_wrapped() -> None:
+    names = [f"{number:03d}_some_object_of_a_long_name" for number in range(9)]
+    one, many = (
+        draw_detections(GREY, K, [], caption=" ".join(some)) for some in (names[:1], names)
+    )
+    assert len(many) - 480 >= 3 * (len(one) - 480)
+    assert (many[:, -4:][480:] == draw_row(640, "")[0, 0]).all()  # nothing is cut at the edge
+
+
 def test_a_tag_is_written_above_its_outline() -> None:
     plain, tagged = (
         draw_detections(GREY, K, [Drawn("cube", POSE, CUBE, tag)]) for tag in ("", "cube 0.34")

@@ -21,6 +21,7 @@ from posefilter.report.sweep_page import (
     make_sweep_page,
 )
 from posefilter.report.sweeps import (
+    Group,
     Job,
     Sweep,
     find_best_group,
@@ -88,10 +89,19 @@ def test_charts_name_the_settings_that_they_take_the_mean_over(tmp_path: Path) -
 def test_cells() -> None:
     """Means and extremes with the sample's standard deviation."""
     auc, share = find_metric("add/auc"), find_metric("particles_on_object")
-    assert format_mean([1.0, 2.0, 6.0], auc) == "3.0 ± 2.6"
-    assert format_mean([0.02], share) == "2.0"  # in the unit of its column
-    assert format_mean([], auc) == "–"
-    assert format_spread([0.01, 0.03], share) == "1.0 to 3.0 (sd 1.4)"
+
+    def group(*values: float | None, key: str = "add/auc") -> Group:
+        numbers: list[dict[str, float]] = [{} if x is None else {key: x} for x in values]
+        return Group({}, [Job({"seed": i}, own, str(i)) for i, own in enumerate(numbers)])
+
+    assert format_mean(group(1.0, 2.0, 6.0), auc) == "3.0 ± 2.6"
+    assert format_mean(group(0.02, key=share.key), share) == "2.0"  # in the unit of its column
+    assert format_mean(group(), auc) == format_mean(group(None), auc) == "–"
+    spread = format_spread(group(0.01, 0.03, key=share.key), share)
+    assert spread == "1.0 to 3.0 (sd 1.4)"
+    # a run without the number, as of a median that is infinite, is not passed over in silence
+    assert format_mean(group(3.0, None, 4.0), auc) == "3.5 ± 0.7 (2 of 3)"
+    assert format_spread(group(3.0, None, 4.0), auc) == "3.0 to 4.0 (sd 0.7) (2 of 3)"
 
 
 def test_of_a_symmetric_object_the_best_is_up_to_symmetry(tmp_path: Path) -> None:

@@ -105,11 +105,15 @@ def write_bag(path: Path, messages: list[tuple[str, str, int, Any]]) -> Path:
 
 
 def write_scene(
-    path: Path, depth_after: tuple[int, ...] = (5, 3), depth_share: float = 1.0
+    path: Path, depth_after: tuple[int, ...] = (5, 3), depth_share: float = 1.0, stray: int = 0
 ) -> Path:
-    """Write a bag of one scene, once every 100 ms; the depth of each comes so many ms later."""
+    """Write a bag of one scene, once every 100 ms; the depth of each comes so many ms later. A few
+    pixels have the depth `stray`, if it is not 0.
+    """
     rgb, depth, K = read_scene()
     depth = (depth * depth_share).astype(np.uint16)
+    if stray:
+        depth[::40, ::40] = stray
     messages = [("/info", CAMERA_INFO, 0, make_info(K))]
     for number, after in enumerate(depth_after):
         time = 100 * (number + 1)
@@ -582,12 +586,14 @@ def test_a_camera_of_another_image_is_named_and_early_images_are_counted(tmp_pat
         list(reader.frames())
 
 
-def test_an_image_without_depth_has_no_object(tmp_path: Path, capfd) -> None:
-    """A camera that starts sends some: they end no conversion."""
-    bag, out = write_scene(tmp_path / "in", depth_share=0), tmp_path / "found.mcap"
+@pytest.mark.parametrize("stray", [0, 20, 900])
+def test_an_image_without_depth_has_no_object(stray: int, tmp_path: Path, capfd) -> None:
+    """A camera that starts or is covered sends some, with noise: they end no conversion."""
+    bag = write_scene(tmp_path / "in", depth_share=0, stray=stray)
+    out = tmp_path / "found.mcap"
     typed = [str(bag), str(out), f"checkpoint={NAME}", *TYPED, *FEW]
     assert run_command("convert_bag", HOME, typed) == 0
-    assert "warning: in 2 of 2 images no pixel has depth" in capfd.readouterr().out
+    assert "warning: 2 of 2 images have no depth, or one color" in capfd.readouterr().out
     found = [open_types().deserialize_cdr(raw, DETECTIONS) for _, _, raw in read_bag(out)]
     assert [len(one.detections) for one in found] == [0, 0]
 

@@ -122,6 +122,8 @@ class Figures(BudgetedCallback):
             batch = Batch(*(x.to(method.device) for x in batch))
             shape, encoding = find_shape(trainer, method), method.encode(hide_annotation(batch))
             when = f"step {step}"
+            if trainer.global_step != step:  # it was put off, and the training went on
+                when += f", networks of step {trainer.global_step}"
             occasion = Occasion(method, shape, kept, one, trace, batch, encoding, when)
             for name, drawing in self.drawings.items():
                 drawn = drawing(occasion)

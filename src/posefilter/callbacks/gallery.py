@@ -39,6 +39,7 @@ class KeptImage(NamedTuple):
     name: str  # of the frame
     # ADD up to symmetry [m]; for methods that tell no pose, the share of particles that miss
     error: float
+    has_symmetries: bool  # the object: ADD up to symmetry is then another number than ADD
     rgb: np.ndarray  # (H, W, 3) uint8
     intrinsics: np.ndarray  # (3, 3) [px]
     estimate: np.ndarray  # (4, 4)
@@ -114,6 +115,7 @@ def keep_image(
         int(batch.frame_id[i]),
         name,
         error,
+        len(method.object_model.symmetries) > 1,
         to_image(batch.rgb[i]),
         numpy(batch.intrinsics),
         numpy(trace.belief.best),
@@ -164,7 +166,8 @@ def draw_tile(one: KeptImage, shape: Shape, tells_pose: bool) -> np.ndarray:
         picture = draw_poses(
             one.rgb, one.intrinsics, one.estimate, shape, view, truth=one.truth, coarse=2
         )
-        caption = f"ADD {format_length(one.error)}"
+        name = "ADD up to symmetry" if one.has_symmetries else "ADD"
+        caption = f"{name} {format_length(one.error)}"
     else:
         picture = draw_particles(one.rgb, one.pixels, one.weights, full_view(height, width, _TILE))
         caption = f"{1 - one.error:.0%} on object"

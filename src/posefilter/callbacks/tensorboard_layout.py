@@ -26,7 +26,7 @@ from tensorboard.plugins.hparams.summary_v2 import hparams_pb
 from torch.utils.tensorboard.summary import custom_scalars
 
 from posefilter.callbacks.tensorboard import get_boards, get_writers, log_numbers
-from posefilter.metrics.registry import find_metric
+from posefilter.metrics.registry import MetricInfo, find_metric
 
 Setting = bool | int | float | str
 
@@ -160,7 +160,8 @@ def describe_run(
     ]
     metrics = [
         MetricColumn(
-            name=MetricName(tag=tag), display_name=f"{tag.split('/')[0]}: {find_metric(tag).title}"
+            name=MetricName(tag=tag),
+            display_name=f"{tag.split('/')[0]}: {name_stored(find_metric(tag))}",
         )
         for tag in METRICS
     ]
@@ -170,3 +171,8 @@ def describe_run(
     metadata = create_summary_metadata(content)
     value = Summary.Value(tag=EXPERIMENT_TAG, metadata=metadata, tensor=NULL_TENSOR)
     return Summary(value=[value]), start
+
+
+def name_stored(info: MetricInfo) -> str:
+    """Return what TensorBoard, which shows numbers as they are stored, calls one."""
+    return info.title if info.factor == 1 else f"{info.label} [share]"

@@ -14,6 +14,7 @@ from posefilter.cli.doubts import say_commonest, say_doubt
 from posefilter.cli.job import Job
 from posefilter.cli.machine import settle
 from posefilter.cli.predict import read_costs
+from posefilter.confidence.blank import find_blank
 from posefilter.errors import Stopped, UserError
 from posefilter.estimator import Estimator
 from posefilter.progress import bars
@@ -71,6 +72,7 @@ def convert_bag(job: Job) -> None:
                     writer.copy(reader.messages())
             except (UserError, KeyboardInterrupt, Stopped) as error:
                 kept = f"the {writer.count} images before it are in {out}"
+                kept += ", without the messages of the bag" if cfg.copy_messages else ""
                 if writer.count and isinstance(error, UserError):
                     raise UserError(f"{error}; {kept}") from error
                 if writer.count:
@@ -85,7 +87,7 @@ class Tally:
 
     found: dict[str, int]  # images by object
     images: int = 0
-    blank: int = 0  # images in which no pixel has depth
+    blank: int = 0  # images in which nothing can be found, see `find_blank`
     warned: int = 0  # of the reader's warnings
     doubted: set[str] = field(default_factory=set)  # objects and reasons that were warned of
     doubts: dict[str, list[str]] = field(default_factory=dict)  # by object, where it is not shown
@@ -93,7 +95,7 @@ class Tally:
     def add(self, frame: BagFrame, results: Sequence[Result], console: str) -> None:
         """Count an image, and say what makes its results doubtful."""
         self.images += 1
-        self.blank += not frame.depth.any()
+        self.blank += bool(find_blank(frame.rgb, frame.depth))
         shown = {one.object for one in list_shown(results)}
         for one in results:
             self.found[one.object] += one.object in shown
@@ -109,7 +111,7 @@ def tell(tally: Tally, reader: BagReader, cfg: DictConfig, out: Path) -> None:
         said += "if they are not: rectify=true"
         say(cfg.console, "distorted", said)
     if tally.blank:
-        said = f"warning: in {tally.blank} of {tally.images} images no pixel has depth"
+        said = f"warning: {tally.blank} of {tally.images} images have no depth, or one color"
         say(cfg.console, "blank", said)
     if reader.skipped:
         said = f"warning: {len(reader.skipped)} messages were left out; the first: "
@@ -135,14 +137,15 @@ def choose_finder(
 ) -> Callable[[BagFrame], list[Result]]:
     """Return what finds the objects in a frame: each frame by itself, or by tracking.
 
-    A frame without any depth, as a camera sends that starts, shows no object.
+    A frame by which nothing can be judged, as a camera sends that starts or is covered, shows no
+    object.
     """
     if track:
         tracker = Tracker(estimator, seed=seed, threads=torch.get_num_threads())
         return lambda frame: [*tracker.update_all(frame.rgb, frame.depth, frame.intrinsics)]
 
     def find(frame: BagFrame) -> list[Result]:
-        if not frame.depth.any():
+        if find_blank(frame.rgb, frame.depth):
             return []
         (results,) = estimator.predict_batch(frame.rgb, frame.depth, frame.intrinsics, seed=seed)
         return results

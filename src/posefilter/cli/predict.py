@@ -41,7 +41,7 @@ from posefilter.weights import expand_weights, is_several
 VIEW = "view.rrd"
 # what an answer consists of, but for the overlay, which each writes anew; the first is a mark of it
 _ALONE = ("pose.json", "belief.png", "belief.npz", "band.png", VIEW)
-_SEVERAL = ("poses.json", "poses.csv", "beliefs/[0-9][0-9]_*.npz")
+_SEVERAL = ("poses.json", "poses.csv", "beliefs/[0-9]*_*.npz")
 _FRAME = (
     "OpenCV camera (x right, y down, z ahead), the object as in its mesh file; camera_from_object "
     "in meters"

@@ -60,6 +60,9 @@ def report(job: Job) -> None:
         if job.cfg.out
         else folder / ("comparison" if kind == "runs" else "report")
     )
+    if not job.cfg.out:  # the folder is this command's own
+        for chart in out.glob("*.png"):
+            chart.unlink()
     charts = write_page(page, out)
     ended(job.cfg.console, "reported", {"report": out / "report.html", f"{charts} charts": out})
 

@@ -37,8 +37,10 @@ from posefilter.tracking.motion import ConstantVelocity
 from posefilter.tracking.records import compute_figures, describe_row, make_row, write_rows
 from posefilter.tracking.settings import FilterSettings, TrackerSettings
 from posefilter.tracking.track import TrackResult
+from posefilter.tracking.track_loss import STATUSES
 from posefilter.tracking.tracker import Tracker
 
+_MOST_IN_GIF = 3000  # frames: some 1.5 GB until they are written
 _DEPTH_SCALE = 10000  # units of depth images in a meter, as YCB-Video's
 
 
@@ -130,6 +132,11 @@ def follow(
         return
     tracker = Tracker(Estimator(methods), settings, cfg.seed, threads)
     say(cfg.console, "video", f"{video.name}: {len(video)} frames", video=video.name)
+    if cfg.save_video == "gif" and len(video) > _MOST_IN_GIF:
+        raise UserError(
+            f"save_video=gif: {len(video)} frames do not fit into memory (at most {_MOST_IN_GIF}); "
+            "choose save_video=mp4, or a stride="
+        )
     for name in video.several:
         sentence = (
             f"{video.name}: frames show several of {name}; one is tracked, and compared with the "
@@ -140,10 +147,13 @@ def follow(
     doubted: set[str] = set()  # objects whose size was said to be wrong, and why frames are blank
     watch = bars(shown=cfg.console != JSON, transient=True)
     with closing(tracker), writer, recorder, watch as bar:
-        task = bar.add_task(video.name, total=len(video))
+        task, room = bar.add_task(video.name, total=len(video)), 0
         for frame in read_frames(video, tracker, cfg):
             results = tracker.update_all(frame.rgb, frame.depth, frame.intrinsics)
-            writer.add(draw_frame(frame, results, shapes))
+            picture = draw_frame(frame, results, shapes)
+            room = room or measure_room(frame, results, shapes)
+            missing = ((0, max(0, room - len(picture))), (0, 0), (0, 0))
+            writer.add(np.pad(picture, missing, constant_values=255))
             recorder.add(frame.rgb, frame.depth, frame.intrinsics, list_seen(results))
             rows = []
             for result in results:
@@ -201,6 +211,21 @@ def draw_frame(
     return draw_detections(frame.rgb, frame.intrinsics, drawn, caption=caption)
 
 
+def measure_room(
+    frame: VideoFrame, results: Sequence[TrackResult], shapes: dict[str, Shape]
+) -> int:
+    """Return the height of a picture with the longest legend: the photograph keeps its size."""
+    longest = max(STATUSES, key=len)
+    names = [one.object for one in results]
+    drawn = [Drawn(f"{name}: {longest}", np.eye(4), shapes[name]) for name in names]
+    lost = f"lost: {', '.join(names)}"
+    black = np.zeros_like(frame.rgb)
+    return max(
+        len(draw_detections(black, frame.intrinsics, drawn[:count], caption=caption))
+        for count, caption in ((len(drawn), ""), (len(drawn), lost), (0, lost))
+    )
+
+
 def list_seen(results: Sequence[TrackResult]) -> list[Seen]:
     """Return the objects of a frame as the 3-D view takes them."""
     seen = []
@@ -241,13 +266,12 @@ def open_videos(cfg: DictConfig, objects: Sequence[str]) -> tuple[Sequence[Video
     if cfg.frames:
         camera = read_intrinsics(cfg.intrinsics, cfg.distortion is not None)
         scale = float(cfg.depth_scale or _DEPTH_SCALE)
-        units = (Path(str(cfg.frames)) / "depth").glob("*.png")  # others may be in meters
-        if cfg.depth_scale is None and any(units):
-            check_depth_scale(camera, scale, f"intrinsics={cfg.intrinsics}")
         lens = None if cfg.distortion is None else parse_distortion(cfg.distortion)
         folder = Path(str(cfg.frames))
         skip = cfg.on_error == "skip"
         video = FolderVideo(folder, camera.K, scale, cfg.stride, lens, camera.size, skip)
+        if cfg.depth_scale is None and not video.holds_meters:
+            check_depth_scale(camera, scale, f"intrinsics={cfg.intrinsics}")
         return [video], lambda _: np.eye(4)
     names = list(objects)
     meshes = open_meshes(data.meshes, data.mesh_scale, data.source, names)

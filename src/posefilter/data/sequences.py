@@ -1,5 +1,6 @@
 """Videos: frames in their order, from a folder of pictures or from a dataset."""
 
+import contextlib
 import re
 from abc import ABC, abstractmethod
 from collections import Counter
@@ -13,10 +14,18 @@ import numpy as np
 from posefilter.data.frames import FrameRecord, NotShown
 from posefilter.data.readers.base import BaseReader
 from posefilter.data.readers.checked import read_checked
-from posefilter.data.readers.decode import expect_size, list_folder, read_color, read_depth
-from posefilter.errors import UserError
+from posefilter.data.readers.decode import (
+    expect_size,
+    holds_meters,
+    list_folder,
+    read_color,
+    read_depth,
+    read_size,
+)
+from posefilter.errors import BadData, UserError
 from posefilter.geometry.lens import undistort_most
 
+_ASKED = 50  # color pictures, whose commonest size is the video's where no camera's file says one
 _TIME = re.compile(r"\d+\.\d+|\d{10,}")
 _COLOR = (".png", ".jpg", ".jpeg", ".bmp", ".webp", ".tif", ".tiff", ".ppm")
 _DEPTH = (".png", ".npy", ".tif", ".tiff", ".pgm", ".pfm")
@@ -80,7 +89,7 @@ class FolderVideo(Video):
         depth_scale: Units of the depth images in a meter.
         stride: Take every so many frames.
         distortion: Of the lens, see `undistort_most`; None: the pictures are rectified.
-        size: Height and width that the intrinsics are of [px]; None: the first picture's.
+        size: Height and width that the intrinsics are of [px]; None: that of most pictures.
         skip: Let color pictures without depth be, where others have some: reading them fails.
 
     Raises:
@@ -100,7 +109,7 @@ class FolderVideo(Video):
         size: tuple[int, int] | None = None,
         skip: bool = False,
     ) -> None:
-        self.name, self._K, self._scale = folder.name, intrinsics, depth_scale
+        self.name, self._K, self._scale = folder.resolve().name, intrinsics, depth_scale
         self._distortion, self._size, self._sized = distortion, size, "the camera's file"
         self.ids: dict[str, int] = {}
         color, numbers = _list_pictures(folder, "rgb", _COLOR)
@@ -129,17 +138,34 @@ class FolderVideo(Video):
         places = numbers or range(len(color))
         self._frames = [*zip(places, color, depth, strict=True)][::stride]
 
+    @property
+    def holds_meters(self) -> bool:
+        """Whether the depth is of floats, which are meters; by the first file that can be read."""
+        for _, _, depth in self._frames:
+            with contextlib.suppress(BadData):
+                return holds_meters(depth)
+        return False
+
     def read(self, index: int) -> VideoFrame:
         """Return a frame."""
         number, color, depth = self._frames[index]
         rgb, z = read_color(color), read_depth(depth, self._scale)
         expect_size(depth, z, rgb.shape[0], rgb.shape[1], color.name)
         if self._size is None:  # the intrinsics are of one size
-            self._size, self._sized = rgb.shape[:2], color.name
+            self._size, self._sized = self._find_size()
         expect_size(color, rgb, *self._size, self._sized)
         if self._distortion is not None:
             rgb, z = undistort_most(rgb, z, self._K, self._distortion)
         return VideoFrame(color.stem, number, rgb, z, self._K, {})
+
+    def _find_size(self) -> tuple[tuple[int, int], str]:
+        """Return height and width of most pictures, or of the first such, and which has them."""
+        sizes: dict[str, tuple[int, int]] = {}
+        for _, color, _ in self._frames[:: max(1, len(self._frames) // _ASKED)]:
+            with contextlib.suppress(BadData):
+                sizes[color.name] = read_size(color)
+        ((common, _),) = Counter(sizes.values()).most_common(1)
+        return common, next(name for name, size in sizes.items() if size == common)
 
 
 class Scene(NamedTuple):

@@ -56,7 +56,7 @@ def draw_detections(
     rows = [draw_legend(entries, picture.shape[1], _LETTERS)] if entries else []
     names, room = f"absent: {', '.join(absent)}", picture.shape[1] - 16
     texts = wrap_text(names, load_font(_LETTERS), room) if absent else []
-    texts += [caption] if caption else []
+    texts += wrap_text(caption, load_font(_LETTERS), room) if caption else []
     rows += [draw_row(picture.shape[1], text, size=_LETTERS) for text in texts]
     return np.concatenate([picture, *rows])
 

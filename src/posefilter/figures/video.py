@@ -43,7 +43,8 @@ class VideoWriter:
         return self
 
     def add(self, picture: np.ndarray) -> None:
-        """Add a picture (H, W, 3) uint8; later ones are brought to the first one's size.
+        """Add a picture (H, W, 3) uint8; later ones are brought to the first one's width, and cut
+        or filled with white below to its height, since what they show must not be squeezed.
 
         Raises:
             UserError: This OpenCV cannot encode videos.
@@ -51,12 +52,16 @@ class VideoWriter:
         if self.form == "none":
             return
         if self._size is None:
-            height, width = picture.shape[:2]
-            scale = min(1.0, _GIF_WIDTH / width) if self.form == "gif" else 1.0
+            rows, columns = picture.shape[:2]
+            scale = min(1.0, _GIF_WIDTH / columns) if self.form == "gif" else 1.0
             # even, as codecs want it
-            self._size = (2 * round(scale * width / 2), 2 * round(scale * height / 2))
-        if picture.shape[1::-1] != self._size:
-            picture = cv2.resize(picture, self._size, interpolation=cv2.INTER_AREA)
+            self._size = (2 * round(scale * columns / 2), 2 * round(scale * rows / 2))
+        width, height = self._size
+        if picture.shape[1] != width:
+            scaled = max(1, round(picture.shape[0] * width / picture.shape[1]))
+            picture = cv2.resize(picture, (width, scaled), interpolation=cv2.INTER_AREA)
+        below = ((0, max(0, height - picture.shape[0])), (0, 0), (0, 0))
+        picture = np.pad(picture[:height], below, constant_values=255)
         if self.form == "gif":
             self._pictures.append(picture)
             return

@@ -236,7 +236,9 @@ _METRICS = (
         short="along a line at start"),
     _signed_unit("diagnostics/pairwise_cosine", "pairwise cosine of the displacements", LOWER,
         "pairwise cosine"),
-    _signed_unit("diagnostics/offset_r2", "true offsets explained (R²)", HIGHER, "offset R2"),
+    # at most 1, and without a least
+    MetricInfo("diagnostics/offset_r2", "true offsets explained (R²)", "", ".2f", HIGHER,
+        short="offset R2"),
     _signed_unit("diagnostics/heading", "cosine of displacement and true offset", HIGHER,
         "offset cosine"),
     _unit("diagnostics/auroc", "AUROC of the likelihood", short="AUROC", form=".2f"),

@@ -55,13 +55,13 @@ def list_visibility(metrics: Mapping[str, Any]) -> list[Block]:
     apart = {f"{ends[0]:g} to {ends[1]:g}": found[ends] for ends in APART if ends in found}
     above = {f"at least {ends[0]:g}": found[ends] for ends in sorted(found) if ends not in APART}
     out: list[Block] = []
-    tables = {"By visibility": apart, "Of images in which enough is visible": above}
+    tables = {"By visibility": apart, "Where enough is visible": above}
     for heading, ranges in tables.items():
         rows = [
             [name, str(own["instances"]), *(format_number(own, key) for key in BY_VISIBILITY)]
             for name, own in ranges.items()
         ]
-        head = ("visible share", "images", *(find_metric(key).title for key in BY_VISIBILITY))
+        head = ("visible share", "instances", *(find_metric(key).title for key in BY_VISIBILITY))
         out += [Heading(heading), Table(head, rows, numeric=range(1, len(head)))] if rows else []
     return out
 

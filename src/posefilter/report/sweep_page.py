@@ -96,7 +96,7 @@ def name_best(sweep: Sweep, winner: Job) -> list[Cell]:
     group = found[find_best_group(found)]
     if sweep.shown and len(group.jobs) > 1:
         infos = list_metrics(sweep)[:1]
-        figures = [f"{info.label} {format_mean(group.of(info.key), info)}" for info in infos]
+        figures = [f"{info.label} {format_mean(group, info)}" for info in infos]
         why = f"({', '.join([*figures, f'mean of {len(group.jobs)} seeds'])})"
         return [Text(spell(group.place), "code"), Text(why, "soft")]
     tied = find_ties(sweep)
@@ -125,7 +125,7 @@ def tabulate_groups(
     rows = list[list[Cell]]()
     for group in found:
         place = [Text(str(group.place[axis]), "code") for axis in sweep.shown]
-        numbers = [format_mean(group.of(info.key), info) for info in infos]
+        numbers = [format_mean(group, info) for info in infos]
         rows.append([*place, str(len(group.jobs)), *numbers])
     head = [*sweep.shown, "runs", *(info.title for info in infos)]
     several = "Where there are several seeds: mean ± standard deviation of the sample."
@@ -134,12 +134,18 @@ def tabulate_groups(
     return [Paragraph([f"The best is marked. {several}"]), table]
 
 
-def format_mean(values: Sequence[float], info: MetricInfo) -> str:
-    """Return numbers of several seeds as one cell."""
+def format_mean(group: Group, info: MetricInfo) -> str:
+    """Return numbers of several seeds as one cell; where not all have one, of how many it is."""
+    values = group.of(info.key)
     if not values:
         return "–"
     spread = f" ± {info.format(stdev(values))}" if len(values) > 1 else ""
-    return info.format(mean(values)) + spread
+    return info.format(mean(values)) + spread + _note_missing(group, values)
+
+
+def _note_missing(group: Group, values: Sequence[float]) -> str:
+    """Return of how many runs a figure is; a median of images mostly missed, for one, is none."""
+    return f" ({len(values)} of {len(group.jobs)})" if len(values) < len(group.jobs) else ""
 
 
 def note_seeds(found: Sequence[Group]) -> list[Block]:
@@ -158,18 +164,19 @@ def tabulate_seeds(found: Sequence[Group], infos: Sequence[MetricInfo]) -> list[
         several = [Group({}, [job for group in found for job in group.jobs])]
     rows = list[list[Cell]]()
     for group in several:
-        spreads = [format_spread(group.of(info.key), info) for info in shown]
+        spreads = [format_spread(group, info) for info in shown]
         rows.append([Text(spell(group.place) or "all", "code"), str(len(group.jobs)), *spreads])
     head = ("setting", "runs", *(info.title for info in shown))
     return [Table(head, rows, numeric=range(1, len(head)), form="sweep")]
 
 
-def format_spread(values: Sequence[float], info: MetricInfo) -> str:
-    """Return the least and the greatest of some numbers, and their standard deviation."""
+def format_spread(group: Group, info: MetricInfo) -> str:
+    """Return the least and the greatest of a group's numbers, and their standard deviation."""
+    values = group.of(info.key)
     if len(values) < 2:
         return "–"
     low, high, sd = (info.format(x) for x in (min(values), max(values), stdev(values)))
-    return f"{low} to {high} (sd {sd})"
+    return f"{low} to {high} (sd {sd}){_note_missing(group, values)}"
 
 
 def show_best(winner: Job, best: Run | None, changed: Sequence[Change] | None) -> list[Block]:

@@ -80,7 +80,8 @@ def compute_figures(rows: Sequence[TrackRow], object_model: ObjectModel) -> dict
     """Return the figures of one object's rows, frames of one video or of several in their order.
 
     A frame counts as missed where the object is lost, and its error as infinite. A false track is
-    a frame in which the object is said to be there, and its ADD-S is 0.1 diameters or more.
+    a frame in which the object is said to be there, and its ADD-S is 0.1 diameters or more, or the
+    dataset has no pose of it: it is away, or hidden wholly.
 
     Args:
         rows: Of one object.

@@ -2,7 +2,7 @@
 
 from posefilter.tracking.settings import TrackerSettings
 
-STARTED, TRACKED, RECOVERED, LOST = "started", "tracked", "recovered", "lost"
+STATUSES = STARTED, TRACKED, RECOVERED, LOST = "started", "tracked", "recovered", "lost"
 
 
 class TrackLossDetector:

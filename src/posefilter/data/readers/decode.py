@@ -19,6 +19,7 @@ from posefilter.limits import check_picture, read_bytes
 _TURNS = range(2, 9)  # of EXIF; 1: none
 _DEPTH_ALONE = {b"\x93NUMPY": "an array", b"PK\x03\x04": "an archive", b"v/1\x01": "an EXR"}
 _PNG, _JPEG = b"\x89PNG\r\n\x1a\n", b"\xff\xd8"
+_TIFF = (b"II*\0", b"MM\0*")
 
 
 def read_color(path: Path) -> np.ndarray:
@@ -36,7 +37,18 @@ def read_color(path: Path) -> np.ndarray:
         raise BadData(path, "color image is not 8-bit", found)
     if image.ndim == 2:
         return np.repeat(image[..., None], 3, axis=-1)
+    if image.shape[2] == 4 and data.startswith(_TIFF):  # OpenCV has multiplied by alpha
+        with Image.open(io.BytesIO(data)) as whole:
+            return np.array(whole.convert("RGBA"))[..., :3].copy()
     return np.ascontiguousarray(image[..., 2::-1])
+
+
+def read_size(path: Path) -> tuple[int, int]:
+    """Return height and width of an image, by its header."""
+    data = read_bytes(path)
+    check_picture(path, data)
+    with Image.open(io.BytesIO(data)) as image:
+        return image.height, image.width
 
 
 def read_depth(path: Path, units: float, scaled_floats: bool = False) -> np.ndarray:
