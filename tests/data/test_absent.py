@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from tests.data.dataset_trees import bop_scene, pose
+from tests.data.dataset_trees import bop_scene, pose, write_mesh
 
 from posefilter.data.absent import find_absent, hide_annotation
 from posefilter.data.frames import FrameRecord
@@ -121,3 +121,23 @@ def test_an_image_counts_once_and_only_where_the_object_is_not_listed() -> None:
     names = {part: find_absent(everything, own, both, part, "box") for part in ("val", "test")}
     assert [one.name for one in names["val"]] == ["a/1", "c/0"]
     assert [one.name for one in names["test"]] == ["d/0", "e/0"]
+
+
+def test_images_that_annotate_one_class_each_may_show_others(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """LINEMOD's, for one: what is not annotated is not known to be away."""
+
+    def told(frames: list[list[tuple[int, np.ndarray]]], name: str) -> bool:
+        root = write_mesh(tmp_path / name / "meshes", "obj_000001")
+        for number, frame in enumerate(frames):
+            bop_scene(tmp_path / name / "data" / f"{number:06d}", [frame])
+        caplog.clear()
+        how = {"meshes": root, "mesh_scale": 1.0, "progress": False, "split": {"test": 1.0}}
+        data = PoseDataModule("bop", tmp_path / name / "data", "obj_000001", **how)
+        data.absent_dataset("test")
+        return "annotates one class" in caplog.text
+
+    other = pose(position=(0.1, 0.05, 0.6))
+    assert told([[(1, pose())], [(2, pose())]], "one")
+    assert not told([[(1, pose()), (2, other)], [(2, pose())]], "both")

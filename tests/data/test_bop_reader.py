@@ -231,6 +231,28 @@ def test_broken_frames_of_one_kind_are_counted_as_one_cause(tmp_path):
     assert dict(reader.skipped) == {"'cam_t_m2c' has the wrong size": 3}
 
 
+def test_one_broken_record_leaves_out_one_image(tmp_path):
+    bop_scene(tmp_path / "000001", [[(5, pose())]] * 4)
+    change("scene_gt.json", lambda c: c["2"][0].update(obj_id=-1))(tmp_path / "000001")
+    reader = BopReader(tmp_path, on_error="skip")
+    assert [record.im_id for record in reader.records()] == [0, 1, 3]
+    assert sum(reader.skipped.values()) == 1
+    bop_scene(tmp_path / "000002", [[(5, pose())]] * 3)
+    (tmp_path / "000002" / "scene_camera.json").write_text("{")
+    reader = BopReader(tmp_path, on_error="skip")
+    assert len(reader.records()) == 3
+    assert sum(reader.skipped.values()) == 1 + 3  # its images, and not one scene
+
+
+def test_a_split_of_several_cameras_is_told(tmp_path):
+    bop_scene(tmp_path / "000001", [[(5, pose())]])
+    for camera in ("cam1", "cam2"):
+        (tmp_path / "000001" / f"scene_gt_{camera}.json").write_text("{}")
+    (tmp_path / "000001" / "scene_gt.json").unlink()
+    with pytest.raises(UserError, match=r"has several cameras \(cam1, cam2\)"):
+        BopReader(tmp_path)
+
+
 @pytest.mark.parametrize("typed", ["1", "obj_1", "obj_01"])
 def test_a_number_that_is_not_padded_is_told_as_it_is_written(tmp_path, typed):
     bop_scene(tmp_path / "000001", [[(1, pose()), (13, FRONT)]])

@@ -40,6 +40,11 @@ SIZE = (480, 640)
             {"extrinsic": [1], "intrinsic": {"intrinsic_matrix": K.T.ravel()}},
             None,
         ),
+        (
+            "both.json",  # depth is aligned to the color image
+            {"depth_intrinsics": FOUR | {"fx": 420.0}, "color_intrinsics": FOUR},
+            None,
+        ),
         ("rows.json", {"K": K}, None),
         ("bare.json", K, None),
         ("scene_camera.json", {"0": {"cam_K": K.ravel()}, "7": {"cam_K": K.ravel()}}, None),

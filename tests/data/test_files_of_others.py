@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from PIL import ExifTags, Image
 
-from posefilter.data.readers.decode import read_color, read_depth
+from posefilter.data.readers.decode import read_color, read_depth, read_label
 from posefilter.errors import BadData
 
 DEPTH = np.array([[0.5, 0.0, 1.25], [2.0, 0.75, 3.0]], np.float32)
@@ -129,3 +129,11 @@ def test_alpha_is_dropped_and_not_multiplied_with(form: str, tmp_path: Path) -> 
     options = {"lossless": True, "exact": True} if form == "WEBP" else {}
     Image.fromarray(picture).save(path, form, **options)
     np.testing.assert_array_equal(read_color(path), picture[..., :3])
+
+
+def test_of_a_palette_the_indices_are_the_classes(tmp_path: Path) -> None:
+    ids = np.array([[0, 1], [2, 3]], np.uint8)
+    image = Image.fromarray(ids, "P")
+    image.putpalette([0, 0, 0, 128, 0, 0, 0, 128, 0, 90, 90, 90])
+    image.save(tmp_path / "label.png")
+    np.testing.assert_array_equal(read_label(tmp_path / "label.png"), ids)

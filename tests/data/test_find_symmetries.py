@@ -85,6 +85,15 @@ def test_the_axis_of_a_cone_as_wide_as_high_is_found(
     assert folds(find_symmetries(mesh), texture=False) == expected
 
 
+@pytest.mark.parametrize(("sides", "members"), [(5, 10), (6, 12)])
+def test_a_prism_has_its_turns_and_half_turns(sides: int, members: int) -> None:
+    solid = trimesh.creation.cylinder(radius=0.05, height=0.04, sections=sides)
+    gray = np.full((2, 2, 3), 128, np.uint8)
+    normals = np.repeat(np.array(solid.face_normals)[:, None], 3, axis=1)
+    mesh = Mesh("prism", np.array(solid.vertices), np.array(solid.faces), None, gray, None, normals)
+    assert len(make_group(select(find_symmetries(mesh), texture=False), 0.1)) == members
+
+
 def test_symmetries_move_with_the_object_and_survive_the_file(tmp_path: Path) -> None:
     """Found in another frame, they are the same turns there; read back, the same matrices."""
     bowl = catalog.build("bowl")

@@ -3,6 +3,7 @@ files show it.
 """
 
 import json
+import math
 import re
 import shutil
 import subprocess
@@ -402,6 +403,9 @@ def test_a_spoilt_record_is_named(tmp_path: Path) -> None:
         ({"sensor": "lidar"}, "sensor=lidar.*ideal, kinect"),
         ({"camera": "gopro"}, "camera=gopro"),
         ({"camera": (1, 2, 3)}, "four numbers"),
+        ({"camera": (600, 600, 4000, 60)}, "principal point is outside of size=.* another size"),
+        ({"camera": (600, 600, math.nan, 60)}, "camera="),
+        ({"instances": 2, "moving": "object"}, "moving=object: one object alone can move"),
         ({"distractors": (5, 2)}, "distractors=5,2"),
         ({"max_occlusion": 1.5}, "max_occlusion=1.5"),
         ({"workers": 0}, "workers=0"),

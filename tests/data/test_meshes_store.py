@@ -59,6 +59,14 @@ def test_all_layouts_are_found(tmp_path: Path) -> None:
     assert store.load("tin").name == "tin"
 
 
+def test_of_one_mesh_in_several_formats_the_same_is_taken_in_any_layout(tmp_path: Path) -> None:
+    for folder in (tmp_path / "flat", tmp_path / "folders" / "tin"):
+        _box(folder / "tin.glb", (0.1, 0.1, 0.2))
+        _box(folder / "tin.obj", (0.1, 0.1, 0.12))
+    for root in (tmp_path / "flat", tmp_path / "folders"):
+        assert np.ptp(MeshStore(root).load("tin").vertices[:, 2]) == pytest.approx(0.12)
+
+
 def test_what_a_mac_puts_beside_a_file_is_no_mesh(tmp_path: Path) -> None:
     for folder in (tmp_path, tmp_path / "mug"):
         folder.mkdir(exist_ok=True)
@@ -101,6 +109,7 @@ def test_units_are_not_guessed(tmp_path: Path) -> None:
         "data.mesh_scale=0.001 (generate, check_data, predict, track: mesh_scale=0.001)"
         in _fails(store, "mm")
     )
+    assert "or 0.01 of centimeters, 0.0254 of inches" in _fails(store, "mm")
     assert "data.mesh_scale=1000" in _fails(store, "tiny")
     twice = MeshStore(tmp_path, scale=1e-6)
     assert "data.mesh_scale=0.001 " in _fails(twice, "mm")

@@ -16,6 +16,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
+import trimesh
 from dataset_trees import (
     HIGH,
     LOW,
@@ -39,6 +40,7 @@ from posefilter.data.module import PoseDataModule
 from posefilter.errors import BadData, UserError
 from posefilter.geometry.camera import resize_intrinsics
 from posefilter.meshes.store import MeshStore
+from posefilter.synthetic.generate import generate
 from posefilter.types import Batch
 
 
@@ -524,13 +526,16 @@ def test_object_models_and_published_points(root, tmp_path):
     dm = module(root, split={"test": 1.0}, num_model_points=500)
     assert dm.object_model(0).points.shape == (500, 3)
     native = dm.reader.native_from_mesh("toy")
-    points = np.random.default_rng(0).uniform(-0.1, 0.1, (20, 3))
+    points = np.random.default_rng(0).uniform(*dm.meshes.load("toy").bounds, (200, 3))
     (tmp_path / "toy").mkdir()
     np.savetxt(tmp_path / "toy" / "points.xyz", points @ native[:3, :3].T + native[:3, 3])
     published = module(root, split={"test": 1.0}, model_points_dir=tmp_path).object_model(0).points
     np.testing.assert_allclose(published, points, atol=1e-6)
     np.savetxt(tmp_path / "toy" / "points.xyz", 1000 * points)
-    with pytest.raises(UserError, match=r"326 m across, .* 0\.182 m; they should be in meters"):
+    with pytest.raises(UserError, match=r"\d\d\d m across, .* 0\.182 m; they should be in meters"):
+        module(root, model_points_dir=tmp_path).object_model(0)
+    np.savetxt(tmp_path / "toy" / "points.xyz", points + 0.05)
+    with pytest.raises(UserError, match=r"off that of the mesh of toy; .* in another frame"):
         module(root, model_points_dir=tmp_path).object_model(0)
     with pytest.raises(UserError, match=r"no toy/points\.xyz"):
         module(root, model_points_dir=tmp_path / "none").object_model(0)
@@ -619,3 +624,35 @@ def test_parts_that_name_each_other_in_a_circle_are_told(root):
     split = {"train": 0.8, "val": "test", "test": "val"}
     with pytest.raises(UserError, match=r"data.split: val and test name each other"):
         module(root, split=split).records("val")
+
+
+def test_points_beside_another_dataset_than_ycb_videos_are_not_taken(tmp_path):
+    """They are of YCB-Video's frame, and FAT and rendered scenes have another."""
+    write_mesh(tmp_path / "meshes", "toy")
+    fat_tree(tmp_path / "data", scenes=2, frames=2)
+    (tmp_path / "models" / "toy").mkdir(parents=True)
+    np.savetxt(tmp_path / "models" / "toy" / "points.xyz", np.eye(3).repeat(9, 0))
+    own = module(tmp_path, split={"test": 1.0}, num_model_points=123).object_model(0)
+    assert own.points.shape == (123, 3)
+
+
+def test_an_object_whose_origin_is_far_from_it_is_judged_by_where_it_is(tmp_path):
+    box = trimesh.creation.box((0.1, 0.2, 0.15))
+    box.apply_translation((8.0, 5.0, 6.0))
+    (tmp_path / "meshes").mkdir()
+    box.export(tmp_path / "meshes" / "bracket.obj")
+    size = {"workers": 1, "progress": False, "size": (160, 120), "distractors": (1, 2)}
+    generate(tmp_path / "data", 8, object="bracket", meshes=tmp_path / "meshes", **size)
+    data = module(tmp_path, object="bracket", split={"test": 1.0})
+    data.setup("test")
+    assert len(data.test_dataset) == 8
+
+
+def test_a_dataset_that_does_not_fit_into_memory_is_told(root, monkeypatch, caplog):
+    pages = {"SC_AVPHYS_PAGES": 1, "SC_PAGE_SIZE": 4096}
+    monkeypatch.setattr("posefilter.data.module.os.sysconf", pages.__getitem__)
+    module(root, split={"test": 1.0}).setup("test")
+    assert "data.cache=disk keeps them in files" in caplog.text
+    caplog.clear()
+    module(root, split={"test": 1.0}, cache="none").setup("test")
+    assert "data.cache" not in caplog.text

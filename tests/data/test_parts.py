@@ -4,6 +4,7 @@ import json
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 import torch
@@ -43,6 +44,27 @@ def test_vertices_are_counted_as_the_file_does(tmp_path: Path) -> None:
     mesh = MeshStore(tmp_path).load("box")
     left = (mesh.vertices[mesh.faces][..., 0] < 0).sum(axis=1) >= 2
     np.testing.assert_array_equal(mesh.parts["left"], left)
+
+
+@pytest.mark.parametrize("form", ["glb", "ply"])
+def test_vertices_of_formats_that_do_not_number_them_are_refused(form: str, tmp_path: Path) -> None:
+    """A PLY of MeshLab has texture coordinates by face: trimesh divides its vertices."""
+    if form == "glb":
+        trimesh.creation.box([0.1, 0.2, 0.06]).export(tmp_path / "box.glb")
+    else:
+        points = ["0 0 0", "0.1 0 0", "0 0.1 0", "0 0 0.1"]
+        faces = ["0 1 2", "0 3 1", "1 3 2", "0 2 3"]
+        uv = ["0 0 1 0 0 1", "0.5 0.5 1 1 1 0.5", "0 0.5 1 0.5 0.5 1", "0.2 0.2 0.7 0.2 0.2 0.7"]
+        header = ["ply", "format ascii 1.0", "comment TextureFile a.png", "element vertex 4"]
+        header += [f"property float {axis}" for axis in "xyz"]
+        header += ["element face 4", "property list uchar int vertex_indices"]
+        header += ["property list uchar float texcoord", "end_header"]
+        rows = [f"3 {face} 6 {one}" for face, one in zip(faces, uv, strict=True)]
+        (tmp_path / "box.ply").write_text("\n".join([*header, *points, *rows]) + "\n")
+        cv2.imwrite(str(tmp_path / "a.png"), np.zeros((4, 4, 3), np.uint8))
+    (tmp_path / "parts.json").write_text(json.dumps({"box": {"tip": {"vertices": [0, 3]}}}))
+    with pytest.raises(UserError, match="use a box"):
+        MeshStore(tmp_path).load("box")
 
 
 def test_a_list_of_vertices_has_the_faces_between_them(meshes: MeshStore) -> None:

@@ -41,15 +41,17 @@ def check_dataset(
     limit: int | None = 50,
     out: Path | str | None = None,
     progress: bool = False,
+    seed: int = 0,
 ) -> dict[str, Any]:
     """Compare frames of each of a reader's objects with its mesh.
 
     Args:
         reader: The dataset, opened with on_error="skip": broken files are reported, not raised.
         meshes: The meshes.
-        limit: Frames of each object at most, spread evenly; None: all.
+        limit: Frames of each object at most, one of each of so many equal parts; None: all.
         out: Gets data_report.json and contact_sheet.png.
         progress: Draw a bar.
+        seed: Of the choice of frames.
 
     Returns:
         `{"objects": [{"object", "frames", "silhouette_iou", "depth_error_mm", "visible_share",
@@ -76,7 +78,7 @@ def check_dataset(
     names = [name for name in reader.objects if name not in left_out]
     share = max(1, _TILES // max(len(names), 1))
     for name in names:
-        row, found, drawn = _check_object(reader, geometry, name, limit, share, progress)
+        row, found, drawn = _check_object(reader, geometry, name, limit, share, progress, seed)
         rows.append(row)
         problems += found
         tiles += drawn
@@ -114,7 +116,13 @@ def format_report(report: dict[str, Any]) -> str:
 
 
 def _check_object(
-    reader: BaseReader, geometry: Geometry, name: str, limit: int | None, drawn: int, progress: bool
+    reader: BaseReader,
+    geometry: Geometry,
+    name: str,
+    limit: int | None,
+    drawn: int,
+    progress: bool,
+    seed: int,
 ) -> tuple[dict[str, Any], list[str], list[np.ndarray]]:
     """Return an object's row, its problems and its tiles."""
     records = reader.records()
@@ -123,8 +131,11 @@ def _check_object(
     if mesh is None:
         return _row(name, [], 0), [f"{name}: no mesh of this name in {geometry.meshes.root}"], []
     native = reader.native_from_mesh(name)
-    spread = np.linspace(0, len(mine) - 1, min(limit or len(mine), len(mine)))
-    chosen = [mine[k] for k in np.unique(spread.astype(int))]
+    count = min(limit or len(mine), len(mine))
+    # at random within equal parts: a fixed step may be a multiple of the dataset's own period
+    shifts = np.random.default_rng(seed).random(count)
+    places = (np.arange(count) + shifts) * len(mine) / max(count, 1)
+    chosen = [mine[k] for k in places.astype(int)]
     broken: Counter[str] = Counter()
     examples: dict[str, str] = {}
     not_shown = 0

@@ -26,11 +26,17 @@ def check_data(job: Job) -> None:
     cfg = job.cfg
     if cfg.data.root is None:
         raise UserError("data.root: is missing; name the dataset's folder")
-    store = open_meshes(cfg.data.meshes, cfg.data.mesh_scale, cfg.data.source, cfg.data.object)
     options = instantiate(cfg.data.options, "data.options") or {}
+    asked = (cfg.data.meshes, cfg.data.mesh_scale, cfg.data.source, cfg.data.object)
+    store = open_meshes(*asked, options.get("mesh_frame"))
     reader = open_reader(cfg.data.source, cfg.data.root, cfg.data.object, store, "skip", **options)
     report = check_dataset(
-        reader, store, limit=cfg.max_frames, out=job.folder, progress=cfg.console != JSON
+        reader,
+        store,
+        limit=cfg.max_frames,
+        out=job.folder,
+        progress=cfg.console != JSON,
+        seed=cfg.seed,
     )
     if cfg.console != JSON:
         print(format_report(report))

@@ -274,8 +274,9 @@ def open_videos(cfg: DictConfig, objects: Sequence[str]) -> tuple[Sequence[Video
             check_depth_scale(camera, scale, f"intrinsics={cfg.intrinsics}")
         return [video], lambda _: np.eye(4)
     names = list(objects)
-    meshes = open_meshes(data.meshes, data.mesh_scale, data.source, names)
     options = resolve(data.options) or {}
+    asked = (data.meshes, data.mesh_scale, data.source, names)
+    meshes = open_meshes(*asked, options.get("mesh_frame"))
     reader = open_whole(data.source, data.root, names, meshes, data.on_error, **options)
     scenes = list_scenes(reader)
     if cfg.scene is not None:

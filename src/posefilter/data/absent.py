@@ -43,6 +43,16 @@ def find_absent(
     return list(found.values())
 
 
+def annotates_one_class(records: Sequence[FrameRecord]) -> bool:
+    """Tell whether a dataset of several classes lists one alone in each image, as LINEMOD does,
+    whose images show others, too.
+    """
+    shown: dict[str, set[str]] = {}
+    for record in records:
+        shown.setdefault(record.name, set()).add(record.object)
+    return len(set().union(*shown.values())) > 1 and all(len(own) == 1 for own in shown.values())
+
+
 def hide_annotation(batch: Batch) -> Batch:
     """Return a batch without mask, pose and visibility: of images without the object, where they
     are another's, and for a method that is tested, which must not see them.

@@ -44,8 +44,9 @@ class RollAndZoom:
     roll: spread of the usual roll [rad]; uniform_roll_probability: that it is uniform instead;
     zoom: range of the factor on the focal length; pivot: the point of the image that stays,
     `center` (the principal point) or `object` (the middle of its mask, so that it may
-    be magnified and stay in the frame). A draw that would push most of the object out of the frame
-    is given up.
+    be magnified and stay in the frame). A draw that would leave less than the
+    share `keep` of the object's pixels in the frame, of as many as it has now or as it would have
+    if it is made smaller, is given up.
 
     object_size: with the probability `object_size_probability` the factor is chosen by the object's
     size in the image instead, so that this is in the range: the square root of the area that it

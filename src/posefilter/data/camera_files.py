@@ -13,7 +13,8 @@ from posefilter.limits import read_json, read_lines, read_yaml
 _LARGEST = 1 << 24  # bytes
 _PAIRS = (("cx", "cy"), ("ppx", "ppy"))  # of the principal point
 _MATRICES = ("camera_matrix", "intrinsic_matrix", "cam_K", "K", "k")
-_INNER = ("intrinsic", "intrinsics", "camera", "depth_intrinsics", "color_intrinsics")
+# that of the color image first: depth is aligned to it
+_INNER = ("intrinsic", "intrinsics", "camera", "color_intrinsics", "depth_intrinsics")
 _DISTORTIONS = ("distortion_coefficients", "coeffs", "dist_coeffs", "distortion", "D", "d")
 _NAMES = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")  # of coefficients, in OpenCV's order
 _PROJECTIONS = ("projection_matrix", "P", "p")

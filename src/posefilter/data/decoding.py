@@ -5,6 +5,8 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 
+import numpy as np
+
 from posefilter.data.cache import FARTHEST, FrameCache, Prepared
 from posefilter.data.frames import FrameRecord, NotShown, Sample
 from posefilter.data.readers.base import BaseReader
@@ -93,13 +95,18 @@ class FrameDecoder:
                 left_out[found.cause] += 1
             elif found.pixels == 0:
                 left_out["the mask vanishes at this image size"] += 1
-            elif found.camera_from_object[2, 3] > FARTHEST:
+            elif self._measure_distance(record, found) > FARTHEST:
                 left_out[f"the object is beyond {FARTHEST:.2f} m, where depth is not kept"] += 1
             elif found.visibility < min_visibility:
                 left_out[f"visibility below {min_visibility}"] += 1
             else:
                 chosen.append(record)
         return chosen, left_out
+
+    def _measure_distance(self, record: FrameRecord, found: Prepared) -> float:
+        """Return the z [m] of an object's center, whose origin may be far from its body."""
+        center = np.append(self._reader.find_center(record.object), 1.0)
+        return float((found.camera_from_object @ center)[2])
 
     def _fetch_all(
         self, records: Sequence[FrameRecord], title: str

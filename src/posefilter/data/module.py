@@ -1,6 +1,7 @@
 """The data of an experiment: one reader, its splits by scene, and loaders."""
 
 import logging
+import os
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property, partial
@@ -11,7 +12,7 @@ import numpy as np
 from lightning import LightningDataModule
 from torch.utils.data import DataLoader
 
-from posefilter.data.absent import find_absent
+from posefilter.data.absent import annotates_one_class, find_absent
 from posefilter.data.cache import CACHES, FrameCache, open_cache
 from posefilter.data.dataset import EpochShuffle, FrameDataset
 from posefilter.data.decoding import FrameDecoder
@@ -33,6 +34,8 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
+_USUAL_WIDTH = 640  # [px] of a camera's image, three quarters of that high
+_IMAGE_BYTES = 5  # of a pixel of color and depth, as they are kept
 _STAGES = {
     "fit": ("train", "val"),
     "validate": ("val",),
@@ -141,7 +144,8 @@ class PoseDataModule(LightningDataModule):
         """The mesh store."""
         if isinstance(self._meshes, MeshStore):
             return self._meshes
-        return open_meshes(self._meshes, self._mesh_scale, self.source, self._object)
+        frame = self._options.get("mesh_frame")
+        return open_meshes(self._meshes, self._mesh_scale, self.source, self._object, frame)
 
     @cached_property
     def reader(self) -> BaseReader:
@@ -225,8 +229,10 @@ class PoseDataModule(LightningDataModule):
                 f"give data.meshes=DIR"
             )
         mesh, native = self.meshes.load(name), self.reader.native_from_mesh(name)
-        size = float(np.linalg.norm(np.subtract(*mesh.bounds)))
-        points = read_model_points(self._model_points_dir, self.root, name, native, size)
+        points, folder = None, self._model_points_dir
+        # of other datasets such points, where they lie beside one, are of another frame
+        if folder is not None or self.source == "ycb_video":
+            points = read_model_points(folder, self.root, name, native, mesh.bounds)
         found = object_model(mesh, points=points, count=self._num_model_points)
         self.reader.check_diameter(name, found.diameter)
         return found
@@ -287,6 +293,13 @@ class PoseDataModule(LightningDataModule):
             own = []  # no image of this dataset shows it
         scenes = self.split_record() if own else {part: {} for part in NAMES}
         found = find_absent(records, own, scenes, split, name)
+        if found and annotates_one_class(records):
+            log.warning(
+                "%s: each image annotates one class; images that do not annotate %s may show it "
+                "and count as lacking it (absent_frames=0 uses none)",
+                self.root,
+                name,
+            )
         order = np.random.default_rng([self._split_seed, 11]).permutation(len(found))
         keep = partial(open_cache, "memory", Path(), "")
         decoder = self._make_decoder(reader, records, keep)
@@ -380,6 +393,20 @@ class PoseDataModule(LightningDataModule):
             self.setup({"train": "fit", "val": "validate", "test": "test"}[split])
         return self._datasets[split]
 
+    def _warn_of_memory(self, images: int) -> None:
+        """Warn where so many images will hardly fit into the memory that is free."""
+        width = self._image_width or _USUAL_WIDTH
+        needed = images * _IMAGE_BYTES * 0.75 * width * width
+        free = os.sysconf("SC_AVPHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+        if needed > 0.7 * free:
+            log.warning(
+                "data.cache=memory: %d images take some %.0f GB, and %.0f GB of memory are free; "
+                "data.cache=disk keeps them in files",
+                images,
+                needed / 1e9,
+                free / 1e9,
+            )
+
     def _prepare(self, split: str) -> FrameDataset:
         """Decode a split's frames into the cache; return those that can be used, at most the
         limit.
@@ -391,6 +418,8 @@ class PoseDataModule(LightningDataModule):
             order = np.random.default_rng([self._split_seed, first]).permutation(len(part))
             part = [part[i] for i in order]
         records = [self._records[i] for i in part]
+        if self._cache_kind == "memory":
+            self._warn_of_memory(len({record.name for record in records[:limit]}))
         chosen, self._left_out[split] = self._decoder.find_usable(
             records, self._least[split], limit, self._on_error, f"decoding {split} frames"
         )

@@ -9,6 +9,7 @@ from posefilter.geometry.rigid import move
 from posefilter.limits import open_text
 from posefilter.paths import is_plain_name
 
+_MOST_OFF = 0.1  # diagonals of the mesh's box, that the points' box may differ by
 _FACTOR = 5.0  # by which points in another unit than meters are larger or smaller, at least
 
 
@@ -17,7 +18,7 @@ def read_model_points(
     root: Path,
     name: str,
     native_from_mesh: np.ndarray,
-    size: float | None = None,
+    bounds: np.ndarray | None = None,
 ) -> np.ndarray | None:
     """Return a class's points in the mesh file's frame, None where the dataset brings none.  -> (P,
     3) [m].
@@ -30,11 +31,12 @@ def read_model_points(
         root: The dataset's folder.
         name: The class.
         native_from_mesh: (4, 4) [m].
-        size: Diagonal of the mesh's bounding box [m]; None: it is not compared with the points'.
+        bounds: (2, 3) least and greatest corner of the mesh's bounding box [m]; None: it is not
+            compared with the points'.
 
     Raises:
         UserError: There are none in `folder`, or the file holds something else, or points in
-            another unit.
+            another unit, or of another frame than the dataset's.
     """
     folders = [Path(folder)] if folder is not None else [root / "models", root.parent / "models"]
     if not is_plain_name(name):
@@ -53,9 +55,19 @@ def read_model_points(
     if native.shape[1] != 3 or len(native) < 4 or not np.isfinite(native).all():
         raise UserError(f"{path}: not rows of three numbers (found {native.shape})")
     own = float(np.linalg.norm(np.ptp(native, axis=0)))
-    if size is not None and not 1 / _FACTOR < own / size < _FACTOR:
+    points = move(native, np.linalg.inv(native_from_mesh))
+    if bounds is None:
+        return points
+    size = float(np.linalg.norm(bounds[1] - bounds[0]))
+    if not 1 / _FACTOR < own / size < _FACTOR:
         raise UserError(
             f"{path}: its points are {own:.3g} m across, and the mesh of {name} is {size:.3g} m; "
             "they should be in meters"
         )
-    return move(native, np.linalg.inv(native_from_mesh))
+    off = float(np.abs(np.stack([points.min(0), points.max(0)]) - bounds).max())
+    if off > _MOST_OFF * size:
+        raise UserError(
+            f"{path}: the box of its points is {1000 * off:.0f} mm off that of the mesh of {name}; "
+            "are they of another object, or in another frame than the dataset's?"
+        )
+    return points

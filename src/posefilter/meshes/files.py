@@ -80,7 +80,8 @@ def _finish(raw: RawMesh, path: Path, name: str, scale: float) -> Mesh:
             given = -given
         normals = np.where(length > 1e-6, given, normals).astype(np.float32)
     uv, texture, colors = merge_materials(raw, path)
-    return Mesh(name, vertices, faces, uv, texture, colors, normals, numbers=used)
+    numbers = used if raw.numbered else np.zeros(0, np.int64)
+    return Mesh(name, vertices, faces, uv, texture, colors, normals, numbers=numbers)
 
 
 def _reverse_corners(raw: RawMesh) -> RawMesh:
@@ -125,7 +126,15 @@ def _read_other(path: Path) -> RawMesh:
         join("corner_colors", 3, 1.0),
         np.repeat(np.arange(len(raws)), counts),
         [raw.materials[0] for raw in raws],
+        # trimesh divides vertices that have several texture coordinates, and a GLB counts anew in
+        # each of its parts
+        path.suffix.lower() == ".ply" and _count_in_file(loaded) == len(raws[0].vertices),
     )
+
+
+def _count_in_file(loaded: Any) -> int:
+    """Return how many vertices a PLY file has."""
+    return int(loaded.metadata.get("_ply_raw", {}).get("vertex", {}).get("length", -1))
 
 
 def _list_parts(scene: trimesh.Scene) -> list[Any]:

@@ -30,7 +30,7 @@ from posefilter.meshes.mesh import (
 from posefilter.meshes.rotational_symmetries import ANY, RotationalSymmetry
 from posefilter.meshes.symmetries import are_parallel, rotation_about
 
-FOLDS = (2, 3, 4)
+FOLDS = (2, 3, 4, 5)
 # Allowed beyond what two samplings of one surface differ by, in diameters: of the mean distance,
 # and of the distance that a fiftieth of the samples exceed, which holes and handles raise.
 MEAN_EXCESS, FAR_EXCESS = 0.01, 0.02

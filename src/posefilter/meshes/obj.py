@@ -36,6 +36,7 @@ class RawMesh(NamedTuple):
     corner_colors: np.ndarray | None  # (F, 3, 3)
     face_material: np.ndarray  # (F,)
     materials: list[Material]
+    numbered: bool = True  # whether vertices have the places that the file counts them by
 
 
 def read_image(path: Path, source: Path) -> np.ndarray:

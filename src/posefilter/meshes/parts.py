@@ -138,6 +138,11 @@ def _select(one: Any, scale: float, mesh: Mesh, said: str) -> np.ndarray:
             if listed.ndim != 1 or listed.dtype.kind not in "iu":
                 raise ValueError("vertices are counted from 0")
             numbers = np.arange(len(mesh.vertices)) if mesh.numbers is None else mesh.numbers
+            if len(numbers) == 0:
+                raise ValueError(
+                    "vertices of a GLB, or of a PLY with texture coordinates by face, have no "
+                    "numbers that can be told; use a box"
+                )
             if len(listed) == 0 or listed.min() < 0 or listed.max() > numbers.max():
                 raise ValueError(f"the mesh has vertices 0 to {numbers.max()}")
             corners_in: np.ndarray = np.isin(numbers, listed)[mesh.faces].sum(axis=1) >= 2

@@ -38,6 +38,7 @@ log = logging.getLogger(__name__)
 # [m] the unit of an object that is larger or smaller must be wrong
 LARGEST, SMALLEST = 10.0, 1e-3
 BUILTIN = "builtin"
+_OTHERS = ", or 0.01 of centimeters, 0.0254 of inches"
 
 
 class WrongUnit(UserError):  # noqa: N818
@@ -48,13 +49,16 @@ class WrongUnit(UserError):  # noqa: N818
         across: Its size [m].
         guess: What is probably wrong.
         scale: Meters in the file's unit, which are probably right.
+        others: What else it may be.
     """
 
-    def __init__(self, path: Path, across: float, guess: str, scale: float) -> None:
+    def __init__(
+        self, path: Path, across: float, guess: str, scale: float, others: str = ""
+    ) -> None:
         self.finding, self.scale = f"{path}: {across:.3g} m across: {guess}", scale
         super().__init__(
             f"{self.finding}; give data.mesh_scale={scale:g} (generate, check_data, predict, "
-            f"track: mesh_scale={scale:g})"
+            f"track: mesh_scale={scale:g}){others}"
         )
 
 
@@ -228,7 +232,8 @@ def _find_meshes(root: Path) -> tuple[dict[str, Path], dict[str, str]]:
         for entry in _list_visible(root):
             if not entry.is_dir():
                 if entry.suffix.lower() in SUFFIXES:
-                    files.setdefault(entry.stem, entry)
+                    known = files.get(entry.stem)
+                    files[entry.stem] = entry if known is None else min(known, entry, key=_rank)
                 continue
             found = _mesh_in(entry)
             if isinstance(found, Path):
@@ -267,7 +272,12 @@ def _mesh_in(folder: Path) -> Path | str | None:
             f"which one is meant"
         )
     # one mesh in several formats
-    return min(others, key=lambda p: SUFFIXES.index(p.suffix.lower()), default=None)
+    return min(others, key=_rank, default=None)
+
+
+def _rank(path: Path) -> int:
+    """Return the place of a file among those of one mesh in several formats: the least is taken."""
+    return SUFFIXES.index(path.suffix.lower()) if path.is_file() else len(SUFFIXES)
 
 
 def _check_unit(mesh: Mesh, path: Path, scale: float) -> None:
@@ -276,6 +286,6 @@ def _check_unit(mesh: Mesh, path: Path, scale: float) -> None:
     if SMALLEST <= across <= LARGEST:
         return
     if across > LARGEST:
-        raise WrongUnit(path, across, "the mesh is probably in millimeters", 0.001 * scale)
+        raise WrongUnit(path, across, "the mesh is probably in millimeters", 0.001 * scale, _OTHERS)
     guess = "in kilometers" if scale == 1 else f"in meters, and taken as {scale:g} m a unit"
     raise WrongUnit(path, across, f"the mesh is probably {guess}", 1000 * scale)

@@ -65,9 +65,12 @@ class Job:
         return np.random.default_rng([self.seed, 1, number])
 
     def lacks_target(self, frame: int) -> bool:
-        """Tell whether the target is taken out of a frame."""
+        """Tell whether the target is taken out of a frame; where frames follow each other, out of
+        all of a scene's.
+        """
         share = self.scenes.absent_fraction
-        return share > 0 and bool(np.random.default_rng([self.seed, 3, frame]).random() < share)
+        number = frame if self.motion.moves == "none" else frame // self.frames_per_scene
+        return share > 0 and bool(np.random.default_rng([self.seed, 3, number]).random() < share)
 
     def files(self, out: Path, frame: int) -> list[Path]:
         """Return the files of a frame in the order of writing."""

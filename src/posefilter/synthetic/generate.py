@@ -318,8 +318,13 @@ def camera_matrix(camera: str | Sequence[float], width: int, height: int) -> np.
         if len(camera) != 4:
             raise UserError(f"camera={list(camera)}: needs four numbers, fx,fy,cx,cy [px]")
         fx, fy, cx, cy = (float(x) for x in camera)
-        if min(fx, fy) <= 0:
+        if not (min(fx, fy) > 0 and np.isfinite([fx, fy, cx, cy]).all()):
             raise UserError(f"camera={list(camera)}: focal lengths must be positive [px]")
+        if not (0 <= cx < width and 0 <= cy < height):
+            raise UserError(
+                f"camera={list(camera)}: the principal point is outside of size={width},{height}; "
+                "are the numbers of another size?"
+            )
     return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]])
 
 
@@ -328,6 +333,10 @@ def _check(job: Job) -> None:
     low, high = job.scenes.distractors
     if high < low:
         raise UserError(f"distractors={low},{high}: needs 0 <= min <= max")
+    if job.motion.moves != "none" and job.scenes.instances > 1:
+        raise UserError(
+            f"moving={job.motion.moves}: one object alone can move; leave instances= out"
+        )
     if job.motion.fully_occluded_frames > job.frames_per_scene:
         raise UserError(
             f"fully_occluded_frames={job.motion.fully_occluded_frames}: a scene has "

@@ -10,6 +10,7 @@ from functools import cache
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from posefilter.errors import UserError
 from posefilter.geometry.rigid import rigid
 from posefilter.meshes.mesh import LOOKALIKE
 from posefilter.meshes.store import MeshStore
@@ -119,6 +120,12 @@ def draw_scene_set(
     goal = library.solid(target)
     distractors = tuple(library.solid(name) for name in chosen)
     photos = [s.mesh.texture for s in distractors if min(s.mesh.texture.shape[:2]) >= 64]
+    least = settings.distractors[0]
+    if len(distractors) + settings.lookalikes < least:
+        raise UserError(
+            f"distractors={least},{settings.distractors[1]}: there are {len(distractors)} other "
+            f"meshes and {settings.lookalikes} look-alikes"
+        )
     names = [f"{LOOKALIKE}{k:02d}" for k in range(settings.lookalikes)]
     same = settings.lookalike_texture == "same"
     lookalikes = tuple(

@@ -72,14 +72,21 @@ class BaseReader:
         """
         return tuple(check_inside(path, self.root) for path in record.files)
 
-    def _leave_out(self, error: BadData) -> None:
-        """Count a broken frame, or raise its error."""
+    def find_center(self, name: str) -> np.ndarray:
+        """Return the center of a class's bounding box in the mesh file's frame, its origin where
+        there is no mesh.  -> (3,) [m].
+        """
+        mesh = None if self._geometry is None else self._geometry.mesh(name)
+        return np.zeros(3) if mesh is None else np.asarray(mesh.bounds).mean(0)
+
+    def _leave_out(self, error: BadData, count: int = 1) -> None:
+        """Count broken frames, or raise their error."""
         if self.on_error != "skip":
             told = [error.detail] if error.detail else []
             advice = "data.on_error=skip leaves such frames out"
             raise BadData(error.path, error.cause, "; ".join([*told, advice])) from error
         cause = _PLACE.sub("", error.cause)  # else each frame would have a cause of its own
-        self.skipped[cause] += 1
+        self.skipped[cause] += count
         self.examples.setdefault(cause, str(error))
 
     def _drop_absent(self) -> None:

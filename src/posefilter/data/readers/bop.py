@@ -13,6 +13,7 @@ import torch
 from posefilter.data.frames import FrameRecord, NotShown, Sample
 from posefilter.data.readers.base import BaseReader
 from posefilter.data.readers.decode import (
+    count_pictures,
     expect_size,
     list_folder,
     need,
@@ -101,9 +102,14 @@ class BopReader(BaseReader):
                 f"{base}: {why} (data.root, data.options.split={'|'.join(splits) or '...'})"
             )
         if not any((folder / "scene_gt.json").exists() for folder in folders):
+            several = sorted(folders[0].glob("scene_gt_*.json"))
+            why = "is the ground truth of this split public? (data.options.split)"
+            if several:  # IPD's, XYZ-IBD's, ITODD-MV's
+                own = ", ".join(path.stem.removeprefix("scene_gt_") for path in several)
+                why = f"it has several cameras ({own}), of which none is read; link the files of "
+                why += "one under the plain names (scene_gt.json, rgb, ...)"
             raise UserError(
-                f"{folders[0]}: has no scene_gt.json, nor has any other scene of {base}: is the "
-                "ground truth of this split public? (data.options.split)"
+                f"{folders[0]}: has no scene_gt.json, nor has any other scene of {base}: {why}"
             )
         scenes = [(folder, self._read_scene(folder)) for folder in folders]
         wanted = [objects] if isinstance(objects, str) else objects
@@ -212,10 +218,12 @@ class BopReader(BaseReader):
         return ycb.CLASSES[number - 1] if known else f"obj_{number:06d}"
 
     def _read_scene(self, folder: Path) -> tuple[dict[str, Any], dict[str, Any]]:
-        """Return a scene's truth and cameras by image, both empty where they are broken and
-        on_error is "skip".
+        """Return a scene's truth and cameras by image, without the images whose records are broken
+        where on_error is "skip".
         """
+        images = 1  # that are left out where the scene's files are broken
         try:
+            images = max(1, count_pictures(folder / "rgb"), count_pictures(folder / "gray"))
             truth, cameras = (
                 read_json(check_inside(folder / f"scene_{kind}.json", self.root))
                 for kind in ("gt", "camera")
@@ -225,14 +233,18 @@ class BopReader(BaseReader):
                     raise BadData(
                         folder / f"scene_{name}.json", "not records by the number of the image"
                     )
-            for image in truth:
-                path = folder / "scene_gt.json"
+        except BadData as error:
+            self._leave_out(error, images)
+            return {}, {}
+        path, whole = folder / "scene_gt.json", dict[str, Any]()
+        for image in truth:
+            try:
                 for k, one in enumerate(need_list(truth, image, path)):
                     whole_number(one, "obj_id", path, f"{image}[{k}].")
-            return truth, {str(int(image)): camera for image, camera in cameras.items()}
-        except BadData as error:
-            self._leave_out(error)
-            return {}, {}
+                whole[image] = truth[image]
+            except BadData as error:
+                self._leave_out(error)
+        return whole, {str(int(image)): camera for image, camera in cameras.items()}
 
     def _list_scene(
         self, base: Path, folder: Path, truth: dict[str, Any], cameras: dict[str, Any]

@@ -19,6 +19,7 @@ from posefilter.limits import check_picture, read_bytes
 _TURNS = range(2, 9)  # of EXIF; 1: none
 _DEPTH_ALONE = {b"\x93NUMPY": "an array", b"PK\x03\x04": "an archive", b"v/1\x01": "an EXR"}
 _PNG, _JPEG = b"\x89PNG\r\n\x1a\n", b"\xff\xd8"
+_PALETTE = b"\x03"  # the color type of a PNG's header
 _TIFF = (b"II*\0", b"MM\0*")
 
 
@@ -96,9 +97,28 @@ def holds_meters(path: Path) -> bool:
     return _read_numbers(path).dtype.kind == "f"
 
 
+def count_pictures(folder: Path) -> int:
+    """Return how many color images a folder has, by their names; 0 where there is no such folder.
+
+    Of FAT's names, `000000.left.depth.png` is none.
+    """
+    if not folder.is_dir():
+        return 0
+    names = (Path(name) for name in list_folder(folder))
+    others = (".depth", ".seg")
+    pictures = (name for name in names if name.suffix.lower() in (".png", ".jpg", ".jpeg", ".tif"))
+    return sum(Path(name.stem).suffix not in others for name in pictures)
+
+
 def read_label(path: Path) -> np.ndarray:
-    """Read an image of class ids.  -> (H, W) uint8 or uint16."""
-    image = decode_image(read_bytes(path), path)
+    """Read an image of class ids, or of a palette, whose indices are the ids.  -> (H, W) uint8 or
+    uint16.
+    """
+    data = read_bytes(path)
+    image = decode_image(data, path)
+    if data.startswith(_PNG) and data[25:26] == _PALETTE:  # OpenCV has put colors for the indices
+        with Image.open(io.BytesIO(data)) as indices:
+            return np.array(indices)
     if image.ndim == 3 and (image == image[..., :1]).all():
         image = image[..., 0]
     if image.ndim != 2 or image.dtype.kind != "u":

@@ -14,6 +14,7 @@ import numpy as np
 from posefilter.data.frames import FrameRecord, NotShown, Sample
 from posefilter.data.readers.base import BaseReader
 from posefilter.data.readers.decode import (
+    count_pictures,
     expect_size,
     list_folder,
     need,
@@ -179,7 +180,7 @@ class FatReader(BaseReader):
             )
             return object_settings(objects), camera_settings(cameras)
         except BadData as error:
-            self._leave_out(error)
+            self._leave_out(error, max(1, count_pictures(folder)))
             return None
 
     def _list_folder(
@@ -235,8 +236,8 @@ class FatReader(BaseReader):
         scene = group if path.parent == self.root else path.parent.relative_to(self.root).as_posix()
         image = f"{scene}/{path.name.removesuffix('.json')}"
         for name, many in found.items():
-            if len(many) > 1 and self._geometry is None:
-                why = "two instances of one class, and no meshes to tell them apart"
+            if len(many) > 1 and (self._geometry is None or self._geometry.mesh(name) is None):
+                why = "two instances of one class, and no mesh that fits to tell them apart"
                 self.skipped[why] += len(many)
                 continue
             if len(many) > 1:

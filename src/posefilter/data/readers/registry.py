@@ -133,16 +133,22 @@ def _asked_part(objects: str | Sequence[str] | None, meshes: MeshStore | None) -
     return parts[0] if parts else None
 
 
-def default_mesh_scale(source: str, objects: str | Sequence[str] | None) -> float:
+def default_mesh_scale(
+    source: str, objects: str | Sequence[str] | None, mesh_frame: str | None = None
+) -> float:
     """Return meters a unit of the mesh files that belong to a dataset: BOP's own models are in
-    millimeters.
+    millimeters, YCB's original ones, whose frame the option `mesh_frame` names, in meters.
     """
-    names = _names(objects)
-    return 0.001 if source == "bop" and all(name.startswith("obj_") for name in names) else 1.0
+    own = all(name.startswith("obj_") for name in _names(objects))
+    return 0.001 if source == "bop" and own and mesh_frame != "original" else 1.0
 
 
 def open_meshes(
-    root: str | Path, scale: float | None, source: str, objects: str | Sequence[str] | None
+    root: str | Path,
+    scale: float | None,
+    source: str,
+    objects: str | Sequence[str] | None,
+    mesh_frame: str | None = None,
 ) -> MeshStore:
     """Open the meshes of a dataset.
 
@@ -151,5 +157,8 @@ def open_meshes(
         scale: Meters a unit of the mesh files; None: as `default_mesh_scale` has it.
         source: The dataset's format.
         objects: The classes asked for.
+        mesh_frame: BOP's option of that name.
     """
-    return MeshStore(root, scale=default_mesh_scale(source, objects) if scale is None else scale)
+    if scale is None:
+        scale = default_mesh_scale(source, objects, mesh_frame)
+    return MeshStore(root, scale=scale)
