@@ -231,7 +231,7 @@ RANGES: dict[str, Range] = {
     **dict.fromkeys(("layers", "blocks"), _whole(1, 1000)),
     "levels": _whole(1, 64),
     "kernel": _whole(1, 1001),
-    "max_width_px": _whole(16, MOST_SIDE),
+    "max_width_px": _whole(32, MOST_SIDE),
     "encoder.spacings_m": Range(0, 1, above=True, many=True),
     "encoder.size": _whole(5, 64),
     "encoder.trunk.stages": _whole(1, 4),
