@@ -5,6 +5,7 @@ from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import torch
 from omegaconf import DictConfig
 
 from posefilter.cli.checkpoints import build_method, methods_of, recipe
@@ -123,7 +124,8 @@ def compose(overrides: Sequence[str] = (), command: str = "train") -> DictConfig
 
 
 def build(config: DictConfig, data: "PoseDataModule | None" = None) -> PoseEstimator:
-    """Build the method that a configuration of `train` describes, untrained.
+    """Build the method that a configuration of `train` describes, untrained; its weights are those
+    of the configuration's seed.
 
     ```python
     config = posefilter.compose(["model=pose_pf", "data.generate.frames=200"])
@@ -144,7 +146,9 @@ def build(config: DictConfig, data: "PoseDataModule | None" = None) -> PoseEstim
         UserError: A setting does not fit; the message names it.
     """
     _check_config(config, "model")
-    method = build_method(recipe(Job(config, {}, [], Path(), "train", False)))
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(int(config.seed))
+        method = build_method(recipe(Job(config, {}, [], Path(), "train", False)))
     if data is not None:
         data.prepare_data()
         data.setup("fit")

@@ -24,7 +24,7 @@ _HERE = Path(__file__).parent
 FOLDERS = (_HERE / "weights", _HERE.parents[1] / "weights")
 
 
-def find_weights(weights: str | Path | None) -> Path:
+def find_weights(weights: str | Path | None, setting: str = "checkpoint") -> Path:
     """Return the checkpoint that a path or a name stands for.
 
     A name is looked up among the weights that ship, then in the cache and at the address in the
@@ -33,26 +33,27 @@ def find_weights(weights: str | Path | None) -> Path:
     Args:
         weights: A checkpoint, a run's folder, a name such as `003_cracker_box`, or a pattern of
             one file.
+        setting: What names it, for messages.
 
     Raises:
         UserError: There is no such file, and no weights of that name; or they cannot be fetched.
     """
     if weights is None or not str(weights):
         raise UserError(
-            "checkpoint: is missing; give checkpoint=RUN/checkpoints/best.ckpt, or a name such as "
+            f"{setting}: is missing; give {setting}=RUN/checkpoints/best.ckpt, or a name such as "
             "003_cracker_box"
         )
     if not isinstance(weights, str | os.PathLike):
-        raise UserError(f"checkpoint={weights}: must be a file, a run's folder or a name")
+        raise UserError(f"{setting}={weights}: must be a file, a run's folder or a name")
     # that of Path raises where there is no such user
     path, name = Path(os.path.expanduser(weights)), str(weights)  # noqa: PTH111
     if path.exists():
         return path
     if is_several(name) and name != ALL:  # a pattern of one file
-        one, *others = expand_weights(name)
+        one, *others = expand_weights(name, setting)
         if others:
             raise UserError(
-                f"checkpoint={weights}: stands for {1 + len(others)} files ({one}, {others[0]}"
+                f"{setting}={weights}: stands for {1 + len(others)} files ({one}, {others[0]}"
                 f"{', ...' if len(others) > 1 else ''}); here it must be one"
             )
         return Path(one)
@@ -63,13 +64,13 @@ def find_weights(weights: str | Path | None) -> Path:
     if url and is_plain_name(name) and not path.suffix:
         return fetch_weights(name, url)
     if path.suffix == ".ckpt" and path.stem in shipped:  # as in a clone, typed elsewhere
-        raise UserError(f"checkpoint={weights}: no such file; did you mean checkpoint={path.stem}?")
+        raise UserError(f"{setting}={weights}: no such file; did you mean {setting}={path.stem}?")
     known = ", ".join(sorted(shipped)) or "none"
     near = [one for one in shipped if name.lower() and name.lower() in one.lower()]
     near = near or difflib.get_close_matches(name.lower(), shipped, 1)
     meant = f"; did you mean {near[0]}?" if len(near) == 1 else ""
     raise UserError(
-        f"checkpoint={weights}: no such file, and no weights of that name ({known}){meant}"
+        f"{setting}={weights}: no such file, and no weights of that name ({known}){meant}"
     )
 
 
@@ -87,21 +88,24 @@ def is_several(weights: object) -> bool:
     return isinstance(weights, Sequence)
 
 
-def expand_weights(weights: str | Path | Sequence[str | Path]) -> list[str | Path]:
+def expand_weights(
+    weights: str | Path | Sequence[str | Path], setting: str = "checkpoint"
+) -> list[str | Path]:
     """Return the checkpoints that a setting stands for, none of them twice.
 
     Args:
         weights: A checkpoint as `find_weights` takes it; `all` for those that ship; a pattern of
             files or of names, such as `weights/00*.ckpt` or `00*`; or a list of such.
+        setting: What names them, for messages.
 
     Raises:
         UserError: There are none.
     """
     found: list[str | Path]
     if not isinstance(weights, str | Path | Iterable):
-        raise UserError(f"checkpoint={weights}: must be a name or a file of weights, or a list")
+        raise UserError(f"{setting}={weights}: must be a name or a file of weights, or a list")
     if not isinstance(weights, str | Path):
-        found = [one for part in weights for one in expand_weights(part)]
+        found = [one for part in weights for one in expand_weights(part, setting)]
     elif not is_several(weights):
         found = [weights]
     elif str(weights) == ALL:
@@ -111,9 +115,7 @@ def expand_weights(weights: str | Path | Sequence[str | Path]) -> list[str | Pat
         found = [*sorted(Path(path.anchor).glob(str(path.relative_to(path.anchor))))]
         found += [file for name, file in list_shipped().items() if fnmatch(name, str(weights))]
     if not found:
-        raise UserError(
-            f"checkpoint={weights}: no weights there; name those of one object at least"
-        )
+        raise UserError(f"{setting}={weights}: no weights there; name those of one object at least")
     return list(dict.fromkeys(found))
 
 

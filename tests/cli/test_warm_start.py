@@ -104,3 +104,9 @@ def test_of_several_the_one_of_the_same_object_is_left_out() -> None:
     assert len(names("all", "025_mug")) == len(list_shipped()) - 1
     with pytest.raises(UserError, match="no_such_weights"):
         read_starts(["003_cracker_box", "no_such_weights"], "025_mug")
+
+
+@pytest.mark.parametrize("weights", [5, "nothing", ["nothing"]])
+def test_a_start_that_is_none_is_named_by_its_own_setting(weights: object) -> None:
+    with pytest.raises(UserError, match="^warm_start="):
+        read_starts(weights, "carton")

@@ -3,6 +3,7 @@
 from typing import Any
 
 import pytest
+import torch
 from omegaconf import OmegaConf
 
 import posefilter
@@ -51,3 +52,20 @@ def test_what_is_no_configuration_is_told(given: Any) -> None:
 def test_a_number_outside_of_its_range_is_told_as_by_a_command() -> None:
     with pytest.raises(posefilter.UserError, match=r"filter\.particles=-5: must be"):
         posefilter.compose(["filter.particles=-5"])
+
+
+def test_a_built_method_has_the_weights_of_the_configurations_seed() -> None:
+    config = posefilter.compose(["model=cnn_patch", "seed=3"])
+    before = torch.random.get_rng_state()
+    one, same = (posefilter.build(config).state_dict() for _ in range(2))
+    assert torch.equal(torch.random.get_rng_state(), before)  # the caller's draws go on
+    config.seed = 4
+    other = posefilter.build(config).state_dict()
+    assert all(torch.equal(value, same[name]) for name, value in one.items())
+    assert not all(torch.equal(value, other[name]) for name, value in one.items())
+
+
+@pytest.mark.parametrize("typed", ["experiment=null", "model/net=null", "model.net=null"])
+def test_a_choice_of_null_is_told_what_there_is(typed: str) -> None:
+    with pytest.raises(UserError, match=rf"{typed}: takes the name of a choice, .*; there are \w+"):
+        posefilter.compose([typed])

@@ -8,6 +8,7 @@ from itertools import product
 from pathlib import Path
 
 import pytest
+import yaml
 
 from posefilter.errors import UserError
 from posefilter.metrics.image_errors import FILE, ImageError, write_errors
@@ -290,3 +291,15 @@ def test_tiles_are_of_the_test_that_the_table_shows(tmp_path: Path, run: Path) -
     found = read_sweep(tmp_path / "sweep")
     page = make_sweep_page(found, read_run(own), None, "x")
     assert [tile.value for tile in page.tiles if tile.label == "ADD AUC"] == ["95.0"]
+
+
+def test_what_changes_no_result_divides_no_setting(tmp_path: Path) -> None:
+    """A sweep that is gone on with under another tag, with other workers, is one sweep."""
+    for seed, tag, workers in ((0, "first", 2), (1, "first", 2), (2, "second", 4)):
+        run = tmp_path / f"seed={seed}"
+        (run / ".hydra").mkdir(parents=True)
+        words = [f"seed={seed}", f"tags=[{tag}]", f"data.workers={workers}"]
+        (run / ".hydra" / "overrides.yaml").write_text(yaml.safe_dump(words))
+        metrics = {"overrides": words, "seed": seed, "add": {"auc": 60.0 + seed}}
+        (run / "metrics.json").write_text(json.dumps(metrics))
+    assert read_sweep(tmp_path).axes == ["seed"]

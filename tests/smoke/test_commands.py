@@ -298,6 +298,32 @@ def test_a_training_shorter_than_its_interval_is_validated_at_its_end(
     assert (tmp_path / "checkpoints" / "best.ckpt").is_file()
 
 
+def test_the_last_step_is_validated_wherever_it_is(tiny_job, tmp_path: Path) -> None:  # type: ignore[no-untyped-def]
+    typed = ("trainer.max_steps=5", "trainer.val_check_interval=3", "callbacks=checkpoints")
+    train(tiny_job(tmp_path, "model=cnn_patch", "logger=csv", *typed))
+    rows = [row for file in tmp_path.rglob("metrics.csv") for row in csv.DictReader(file.open())]
+    assert [int(row["step"]) for row in rows if row.get("val/score")] == [3, 5]
+    assert read(tmp_path)["training"]["steps"] == 5
+
+
+def test_a_split_without_a_test_is_refused_before_the_training(tiny_job, tmp_path: Path) -> None:  # type: ignore[no-untyped-def]
+    with pytest.raises(UserError, match=r"data\.split: no frames for test"):
+        train(tiny_job(tmp_path, "model=cnn_patch", "data.split={train: 0.5, val: 0.5}"))
+    assert not (tmp_path / "checkpoints").exists()
+
+
+@pytest.mark.parametrize(
+    ("typed", "told"),
+    [
+        ("callbacks.figures=true", r"callbacks\.figures=True: is no callback; null leaves it out"),
+        ("logger.tensorboard=5", r"logger\.tensorboard=5: is no logger; null leaves it out"),
+    ],
+)
+def test_what_is_no_callback_is_refused(typed: str, told: str, tiny_job, tmp_path: Path) -> None:  # type: ignore[no-untyped-def]
+    with pytest.raises(UserError, match=told):
+        train(tiny_job(tmp_path, "model=cnn_patch", f"++{typed}"))
+
+
 @pytest.mark.slow
 def test_the_same_seed_gives_the_same_result_and_another_another(tiny_job, tmp_path: Path) -> None:  # type: ignore[no-untyped-def]
     found = []

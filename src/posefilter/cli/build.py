@@ -12,6 +12,7 @@ from lightning.pytorch.loggers import Logger, TensorBoardLogger
 from lightning.pytorch.plugins.environments import SLURMEnvironment
 from omegaconf import DictConfig, OmegaConf
 
+from posefilter.callbacks.final_validation import FinalValidation
 from posefilter.callbacks.tensorboard_layout import TensorBoardLayout
 from posefilter.cli.comparing import comparable
 from posefilter.cli.console import JSON
@@ -116,17 +117,25 @@ def build_trainer(job: Job) -> Trainer:
         said = "trainer.val_check_interval=%d is more than max_steps=%d: validated at the end"
         log.info(said, interval, steps)
         cfg.trainer.val_check_interval = steps
-    callbacks: list[Callback] = _build_all(cfg.callbacks, "callbacks")
+    callbacks: list[Callback] = _build_all(cfg.callbacks, "callbacks", Callback)
     for layout in callbacks:
         if isinstance(layout, TensorBoardLayout):
             layout.settings = comparable(job)
             layout.swept = tuple(map(key_of, job.overrides if job.swept else ()))
-    callbacks.append(progress(cfg.console))
-    loggers: list[Logger] = _build_all(cfg.get("logger"), "logger")
+    callbacks += [progress(cfg.console), FinalValidation()]
+    loggers: list[Logger] = _build_all(cfg.get("logger"), "logger", Logger)
     for logger in loggers:
         if not isinstance(logger, TensorBoardLogger):  # whose settings TensorBoardLayout logs
             logger.log_hyperparams(comparable(job))
-    return make_trainer(cfg.trainer, callbacks, loggers)
+    trainer = make_trainer(cfg.trainer, callbacks, loggers)
+    environment = trainer._accelerator_connector.cluster_environment
+    if job.swept and trainer.world_size > 1 and not environment.creates_processes_externally:
+        raise UserError(
+            f"trainer.devices={cfg.trainer.get('devices')}: each job of a sweep trains in one "
+            "process, since the others would begin the whole sweep; start the runs one by one, "
+            "without -m"
+        )
+    return trainer
 
 
 def _check_trainer(node: DictConfig) -> None:
@@ -154,8 +163,14 @@ def _check_trainer(node: DictConfig) -> None:
         )
 
 
-def _build_all(node: DictConfig, where: str) -> list[Any]:
-    return [made for made in (instantiate(node, where) or {}).values() if made]
+def _build_all(node: DictConfig, where: str, kind: type) -> list[Any]:
+    """Build callbacks or loggers; raises UserError where one is another thing."""
+    made = {name: one for name, one in (instantiate(node, where) or {}).items() if one}
+    for name, one in made.items():
+        if not isinstance(one, kind):
+            what = kind.__name__.lower()
+            raise UserError(f"{where}.{name}={one}: is no {what}; null leaves it out")
+    return [*made.values()]
 
 
 def make_trainer(

@@ -84,30 +84,31 @@ def _with_lightning(kind: Any) -> Any:
     return with_lightning(kind) if issubclass(kind, PoseEstimator) else kind
 
 
-def find_checkpoint(path: str | Path | None) -> Path:
-    """Return the file that a checkpoint's path, its run's folder, or a name stands for.
+def find_checkpoint(path: str | Path | None, setting: str = "checkpoint") -> Path:
+    """Return the file that a checkpoint's path, its run's folder, or a name stands for; `setting`
+    is what named it.
 
     Raises:
         UserError: There is none.
     """
-    file = find_weights(path)
+    file = find_weights(path, setting)
     if file.is_dir():
         file = file / "checkpoints" / "best.ckpt"
         if not file.is_file():
-            raise UserError(f"checkpoint={path}: is a folder without checkpoints/best.ckpt")
+            raise UserError(f"{setting}={path}: is a folder without checkpoints/best.ckpt")
     if not file.is_file():
-        raise UserError(f"checkpoint={path}: no such file")
+        raise UserError(f"{setting}={path}: no such file")
     return file
 
 
-def read_checkpoint(path: str | Path | None) -> dict[str, Any]:
-    """Read a checkpoint of ours, as data that others may have written.
+def read_checkpoint(path: str | Path | None, setting: str = "checkpoint") -> dict[str, Any]:
+    """Read a checkpoint of ours, as data that others may have written; `setting` is what named it.
 
     Raises UserError where the path holds none, and where what it holds could do harm (see `archive`
     and `recipe`).
     """
-    file = find_checkpoint(path)
-    said = f"checkpoint={path}"
+    file = find_checkpoint(path, setting)
+    said = f"{setting}={path}"
     with naming(said):
         check_archive(file)
         try:

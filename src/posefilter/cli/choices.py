@@ -28,6 +28,11 @@ def check_choices(arguments: list[str], conf: Path, command: str | None = None) 
         key, _, value = argument.partition("=")
         group = key.replace(".", "/") if re.fullmatch(r"\w+", value) else key
         own = re.fullmatch(r"[\w/]+", group) is not None and (conf / group).is_dir()
+        if own and value == "null":
+            raise UserError(
+                f"{argument}: takes the name of a choice, or is left out for the default; there "
+                f"are {', '.join(list_choices(conf / group))}"
+            )
         if own and group != key:
             choice = f"{group}={value}"
             raise UserError(f"{argument}: names a choice; type {rename(choice, command) or choice}")

@@ -6,10 +6,8 @@ from typing import Any
 from posefilter.cli.components import chosen
 from posefilter.cli.job import Job
 from posefilter.cli.plain import to_plain
-from posefilter.report.settings import PASSING
+from posefilter.report.settings import HANDS, PASSING
 
-# by whose change nothing else comes out
-HANDS = ("out", "console", "tags", "threads", "data.workers", "data.generate.workers")
 _PLACES = ("data.root", "data.cache_dir")
 _PASSING = (*PASSING, "callbacks", "logger")  # where and how, not what
 

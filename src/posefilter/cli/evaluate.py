@@ -84,8 +84,7 @@ def evaluate(job: Job) -> float:
 def _of_checkpoint(job: Job) -> tuple[dict[str, Any], dict[str, Path]]:
     checkpoint = read_checkpoint(job.cfg.checkpoint)
     method = method_of(checkpoint, changes(job.cfg))
-    if job.cfg.seed is not None:
-        method.seed = job.cfg.seed
+    method.seed = job.cfg.seed
     tolerance = read_pose_tolerance(job.cfg.pose_tolerance)
     if tolerance is not None and method.calibration is None:
         raise UserError(
@@ -107,6 +106,8 @@ def _of_checkpoint(job: Job) -> tuple[dict[str, Any], dict[str, Path]]:
     records = Records()
     callbacks = [records, ErrorTable(job.folder), progress(job.cfg.console)]
     trainer = make_trainer(job.cfg.trainer, callbacks)
+    if trainer.limit_test_batches == 0:
+        raise UserError("trainer.limit_test_batches=0: leaves nothing to test")
     device = trainer.strategy.root_device
     trainer.test(method, datamodule=data, verbose=False)
     method.to(device)  # which Lightning has left

@@ -13,7 +13,6 @@ from hydra.experimental.callback import Callback
 from omegaconf import DictConfig
 from omegaconf.errors import OmegaConfBaseException
 
-from posefilter.cli.comparing import HANDS
 from posefilter.cli.job import Job, check_out
 from posefilter.cli.plain import key_of
 from posefilter.cli.ranks import is_follower
@@ -21,6 +20,7 @@ from posefilter.errors import Carrier, UserError
 from posefilter.files import remove_parts, write_whole
 from posefilter.limits import read_json
 from posefilter.locks import hold
+from posefilter.report.settings import HANDS
 
 FAILED = "failed.json"  # in the folder of a sweep's job
 OUTPUTS = "outputs"  # where commands write unless told otherwise

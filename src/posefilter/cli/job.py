@@ -30,7 +30,7 @@ _NEEDED = {
     "track": ("stride", "fps", "seed", "out", "tracker"),
     "generate": ("seed",),
     "check_data": ("data", "out"),
-    "evaluate": ("trainer", "absent_frames"),
+    "evaluate": ("trainer", "absent_frames", "seed"),
     "onboard": ("seed", "budget_minutes", "test_frames", "workers"),
     "export": ("points", "max_mb", "format", "width", "height"),
 }

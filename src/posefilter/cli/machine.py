@@ -27,6 +27,8 @@ def settle(threads: int | None, seed: int) -> None:
     keep_freed_memory()
     settle_processes()
     torch.set_num_threads(threads or min(8, torch.get_num_threads()))
+    if threads:  # where it is not set, Lightning gives each of several processes its share of cores
+        os.environ["OMP_NUM_THREADS"] = str(threads)
     cv2.setNumThreads(1)
     _seed_everything(seed)
 

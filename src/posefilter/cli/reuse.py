@@ -52,7 +52,9 @@ def learned_from(job: Job) -> str:
     the same.
 
     Left out is what only testing reads: a few settings of the data, what the method names in
-    `test_only_settings`, and `filter` where training rolls out another.
+    `test_only_settings`, and `filter` where training rolls out another. The weights of each step
+    are then the same; which step is the best, the validations of the job that trained have chosen,
+    by its own filter.
     """
     cfg = job.cfg.copy()
     cfg.folder = ""
@@ -89,7 +91,8 @@ def take_over(job: Job) -> dict[str, Any] | None:
         save_whole({**checkpoint, "recipe": now}, job.folder / "checkpoints" / "best.ckpt")
         sentence = (
             f"{job.folder.name}: only tested, with what {folder.name} has learned; "
-            f"training does not depend on {others}"
+            f"training does not depend on {others}, but its best checkpoint was chosen by "
+            f"validations of {folder.name}"
         )
         say(job.cfg.console, "reused", sentence, run=str(job.folder), trained=str(folder))
         return {**training, "trained_as": folder.name}

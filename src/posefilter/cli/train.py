@@ -99,6 +99,7 @@ def build(job: Job) -> Run:
         said = "warm start from %s (%d files): %d tensors copied, %d left as drawn"
         log.info(said, job.cfg.warm_start, len(starts), copied, left)
     rehearse(method, data)
+    data.check_test()  # which comes last
     if find_begun(job) is not None:
         check_scenes(job.folder / DATA, data)
     if not is_follower():

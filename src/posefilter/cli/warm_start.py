@@ -27,7 +27,7 @@ def read_starts(weights: Any, own: str) -> list[dict[str, Any]]:
     Raises:
         UserError: There is no such checkpoint, or it is unreadable.
     """
-    found = [read_checkpoint(one) for one in expand_weights(weights)]
+    found = [read_checkpoint(one, "warm_start") for one in expand_weights(weights, "warm_start")]
     others = [one for one in found if (one.get("object_model") or {}).get("name") != own]
     return found if len(found) == 1 or not others else others
 

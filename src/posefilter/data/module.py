@@ -272,8 +272,21 @@ class PoseDataModule(LightningDataModule):
 
     @property
     def test_dataset(self) -> FrameDataset:
-        """The test frames."""
+        """The test frames.
+
+        Raises:
+            UserError: The split leaves none.
+        """
+        self.check_test()
         return self._dataset("test")
+
+    def check_test(self) -> None:
+        """Raise UserError where the split leaves no frames to test on; nothing is decoded."""
+        if not self._parts["test"]:
+            raise UserError(
+                "data.split: no frames for test; give it a share, such as "
+                "'data.split={train: 0.8, val: 0.1, test: 0.1}'"
+            )
 
     def absent_dataset(self, split: str, limit: int | None = None) -> FrameDataset:
         """Return images of a split in which the object is not, the first so many of a fixed

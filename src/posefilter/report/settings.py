@@ -5,6 +5,8 @@ from collections.abc import Iterable, Mapping
 from typing import Any, NamedTuple
 
 # where and how a run was made, not what it was
+# by whose change nothing else comes out
+HANDS = ("out", "console", "tags", "threads", "data.workers", "data.generate.workers")
 PASSING = ("out", "folder", "console", "threads", "resume", "debug", "plugins")
 
 
