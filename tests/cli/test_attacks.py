@@ -78,7 +78,7 @@ LINES = {
         ["data.meshes=nowhere", "data.root=."],
         "data.meshes=nowhere: no such folder",
     ),
-    "no model": ("train", ["model=null"], "model=null: cannot be read"),
+    "no model": ("train", ["model=null"], "model=null: takes the name of a choice"),
     "no picture": ("predict", ["rgb=5", "depth=5", "intrinsics=1,1,1,1"], "rgb=5: no such file"),
     "an umlaut": (
         "train",

@@ -108,5 +108,5 @@ def test_of_several_the_one_of_the_same_object_is_left_out() -> None:
 
 @pytest.mark.parametrize("weights", [5, "nothing", ["nothing"]])
 def test_a_start_that_is_none_is_named_by_its_own_setting(weights: object) -> None:
-    with pytest.raises(UserError, match="^warm_start="):
+    with pytest.raises(UserError, match=r"^warm_start="):
         read_starts(weights, "carton")

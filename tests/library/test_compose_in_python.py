@@ -67,5 +67,7 @@ def test_a_built_method_has_the_weights_of_the_configurations_seed() -> None:
 
 @pytest.mark.parametrize("typed", ["experiment=null", "model/net=null", "model.net=null"])
 def test_a_choice_of_null_is_told_what_there_is(typed: str) -> None:
-    with pytest.raises(UserError, match=rf"{typed}: takes the name of a choice, .*; there are \w+"):
+    with pytest.raises(
+        posefilter.UserError, match=rf"{typed}: takes the name of a choice, .*; there are \w+"
+    ):
         posefilter.compose([typed])

@@ -12,11 +12,11 @@ from lightning.pytorch.loggers import Logger, TensorBoardLogger
 from lightning.pytorch.plugins.environments import SLURMEnvironment
 from omegaconf import DictConfig, OmegaConf
 
-from posefilter.callbacks.final_validation import FinalValidation
 from posefilter.callbacks.tensorboard_layout import TensorBoardLayout
 from posefilter.cli.comparing import comparable
 from posefilter.cli.console import JSON
 from posefilter.cli.files import WholeCheckpoints
+from posefilter.cli.final_validation import FinalValidation
 from posefilter.cli.instantiate import instantiate
 from posefilter.cli.job import Job
 from posefilter.cli.plain import key_of, resolve

@@ -28,7 +28,7 @@ def check_choices(arguments: list[str], conf: Path, command: str | None = None) 
         key, _, value = argument.partition("=")
         group = key.replace(".", "/") if re.fullmatch(r"\w+", value) else key
         own = re.fullmatch(r"[\w/]+", group) is not None and (conf / group).is_dir()
-        if own and value == "null":
+        if own and value == "null" and key != "preset":
             raise UserError(
                 f"{argument}: takes the name of a choice, or is left out for the default; there "
                 f"are {', '.join(list_choices(conf / group))}"
