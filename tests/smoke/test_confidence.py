@@ -109,6 +109,27 @@ def test_a_calibration_is_stored_and_not_overwritten(
     assert "absent_fraction=1" in capfd.readouterr().err
 
 
+def test_sets_are_learned_alone_and_all_else_stays(
+    calibrated: Path,
+    weights: Path,
+    tiny_scenes: Path,
+    tmp_path: Path,
+    capfd: pytest.CaptureFixture[str],
+) -> None:
+    out, split = tmp_path / "sets.ckpt", "data.split={train: 0, val: 1.0, test: 0}"
+    typed = [f"data.root={tiny_scenes}", split, "data.min_visibility_test=0", *QUIET]
+    alone = [*typed, "sets_only=true", "frames=11", f"out={out}"]
+    assert run_command("calibrate", HOME, [f"checkpoint={weights}", *alone]) == 2
+    assert "has no probability to group frames by" in capfd.readouterr().err
+    assert run_command("calibrate", HOME, [f"checkpoint={calibrated}", *alone]) == 0
+    before, now = (torch.load(x, weights_only=True)["calibration"] for x in (calibrated, out))
+    sets, other = now.pop("conformal"), before.pop("conformal")
+    assert str(now) == str(before)
+    assert sets != other
+    assert sum(map(len, sets["scores"])) == 11
+    assert sets["by"] == "probability"
+
+
 def test_an_absent_object_gets_no_pose_and_status_1(
     calibrated: Path, tiny_scenes: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:

@@ -6,6 +6,7 @@ import math
 import sys
 import time
 from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
@@ -30,8 +31,8 @@ from posefilter.confidence.belief_scale import (
     fit_belief_scale,
     measure_spread,
 )
-from posefilter.confidence.calibration import Assessment, Calibration
-from posefilter.confidence.conformal import LITTLE_VISIBLE
+from posefilter.confidence.calibration import Assessment, Calibration, standardize
+from posefilter.confidence.conformal import LITTLE_VISIBLE, choose_edges, fit_conformal
 from posefilter.confidence.fit import (
     FEWEST,
     Frames,
@@ -80,8 +81,13 @@ def calibrate(job: Job) -> None:
     if out.exists():  # a training that still runs may write a better one meanwhile, which is kept
         hold(file.parent.parent if file.parent.name == "checkpoints" else file.parent)
     checkpoint = read_checkpoint(cfg.checkpoint)
-    check_out(checkpoint, file, out, cfg.overwrite)
+    check_out(checkpoint, file, out, cfg.overwrite or cfg.sets_only)
     method = method_of(checkpoint, lightning=False)
+    if cfg.sets_only and method.calibration is None:
+        raise UserError(
+            f"sets_only: checkpoint={cfg.checkpoint} has no probability to group frames by; "
+            "calibrate it first"
+        )
     name = method.object_model.name
     if "pose" not in method.capabilities:
         raise UserError(
@@ -99,6 +105,13 @@ def calibrate(job: Job) -> None:
             f"{data.root}: {len(data.val_dataset)} frames of its validation scenes show {name}, "
             f"and {FEWEST} are needed"
         )
+    if cfg.sets_only:
+        calibration = learn_sets(method, [data.val_dataset], cfg.console)
+        save_whole({**checkpoint, "calibration": calibration.to_plain()}, out)
+        title = f"{name}: conformal sets"
+        show_table(cfg.console, title, list_groups(calibration))
+        ended(cfg.console, "calibrated", {"weights": out}, [typed_prediction(out)], object=name)
+        return
     without = cfg.frames if cfg.absent_frames is None else cfg.absent_frames
     absent = [data.absent_dataset("val", without)]
     if cfg.absent is not None and len(absent[0]) < without:
@@ -240,6 +253,30 @@ def learn(
     return fit_answers(frames, beliefs, first, method.object_model, source)
 
 
+def learn_sets(method: PoseEstimator, present: Sequence[FrameDataset], console: str) -> Calibration:
+    """Return the calibration of a method with other conformal sets, learned from frames that it has
+    not seen: their probabilities, and the widths of their beliefs, are then those that new frames
+    get, as split conformal prediction supposes.
+
+    Args:
+        method: A calibrated method.
+        present: Frames with the object, of none that the calibration is of.
+        console: "rich" or "json".
+    """
+    calibration, model = method.calibration, method.object_model
+    assert calibration is not None
+    frames, (beliefs, truth), _ = collect_frames(method, present, [], console)
+    values = frames.values[:, [frames.features.index(name) for name in calibration.features]]
+    probability = calibration.assess_features(torch.from_numpy(values)).probability
+    if calibration.belief_scale is not None:
+        x = torch.from_numpy(standardize(values, calibration.center, calibration.scale))
+        beliefs, _ = calibrate_belief(beliefs, probability, x, calibration.belief_scale, model)
+    scores, held = score_truth(beliefs, truth, model).nonconformity.numpy(), probability.numpy()
+    edges = choose_edges(held)
+    sets = fit_conformal(scores, held, edges, "probability", frames.visibility)
+    return replace(calibration, conformal=sets)
+
+
 def fit_answers(
     frames: Frames,
     beliefs: Beliefs,
@@ -334,12 +371,7 @@ def tell(job: Job, method: PoseEstimator, calibration: Calibration, out: Path) -
         ("of these, the pose is right", str(counts["right"])),
         ("frames without", str(counts["absent"])),
     ]
-    if calibration.conformal is not None:
-        shown = " and ".join(str(len(own)) for own in calibration.conformal.scores)
-        rows.append(("groups of those with it, by rising probability", shown))
-    if calibration.conformal is not None and calibration.conformal.occluded:
-        shown = " and ".join(str(len(own)) for own in calibration.conformal.occluded)
-        rows.append((f"of these, visibility below {LITTLE_VISIBLE}", shown))
+    rows += list_groups(calibration)
     few = f"that of the particles: fewer than {FEWEST_RIGHT} estimates are right"
     width = f"learned from {counts['right']} right estimates"
     rows.append(("width of a belief", few if calibration.belief_scale is None else width))
@@ -350,3 +382,14 @@ def tell(job: Job, method: PoseEstimator, calibration: Calibration, out: Path) -
     following = [typed_prediction(out)]
     content = {"object": method.object_model.name, "counts": dict(counts), "quality": dict(quality)}
     ended(job.cfg.console, "calibrated", {"weights": out}, following, **content)
+
+
+def list_groups(calibration: Calibration) -> list[tuple[str, str]]:
+    """Return rows that tell how many frames each group of the conformal sets has."""
+    sets = calibration.conformal
+    if sets is None:
+        return []
+    parts = {"groups of those with it, by rising probability": sets.scores}
+    if sets.occluded:
+        parts[f"of these, visibility below {LITTLE_VISIBLE}"] = sets.occluded
+    return [(name, " and ".join(str(len(own)) for own in part)) for name, part in parts.items()]

@@ -11,10 +11,11 @@ The groups are told apart by the calibrated probability, at the quantiles of the
 A belief that is likely to be wrong gives the truth a far higher score than one that is likely to be
 right, so that one limit for all would cover too much of the sure ones and too little of the others.
 The probability of a calibration frame is that of a regression that has not seen it, as new frames
-are not seen either (cross-conformal prediction, Vovk 2015).  It is still not of quite the same
-regression, so that the guarantee holds nearly, not exactly: see docs/results/confidence.md for
-what was measured.  Calibrations of before have two groups, by the feature `surface` at a fixed
-limit.
+are not seen either. Where the frames of the sets are others than the regression's (`calibrate.py
+sets_only=true`) it is the same regression, and the guarantee holds; else it is one of five, fitted
+to the other frames (cross-conformal prediction, Vovk 2015), and the guarantee holds nearly: see
+docs/results/confidence.md for what was measured.  Calibrations of before have two groups, by the
+feature `surface` at a fixed limit.
 
 Little of the object visible is harder than the probability shows, and a new frame's visibility is
 not known. A group that has enough calibration frames with less than a quarter visible therefore
