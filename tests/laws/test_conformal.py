@@ -65,6 +65,8 @@ def test_occluded_frames_raise_the_limit_where_they_are_enough_for_the_level() -
     assert found.find_limit(0.8, 0.3) == 16  # as the group's own
     assert found.find_limit(0.9, 0.3) == 18  # the sixth of five: the group's own limit alone
     assert replace(found, occluded=(occluded[1:],)).find_limit(0.5, 0.3) == 10  # four are too few
+    rare = replace(found, scores=(own + (20.0,) * 7,))
+    assert rare.find_limit(0.5, 0.3) == 14  # five of 26 are less than a fifth: the 14th of 26
     easy = (-9.0, -8.0, -7.0, -6.0, -5.0)
     assert replace(found, occluded=(easy,)).find_limit(0.5, 0.3) == 10  # never a smaller set
 
@@ -215,8 +217,8 @@ def test_groups_by_probability_cover_the_hard_frames_as_often_as_the_easy_ones(
         made = fit_calibration(draw_hard_and_easy(650, rng)[0], "scenes")
         assert made.conformal is not None
         assert made.conformal.by == "probability"
-        assert len(made.conformal.scores) == 5
-        assert all(30 < len(own) < 150 for own in made.conformal.scores)
+        assert len(made.conformal.scores) in (5, 6)
+        assert all(18 < len(own) < 150 for own in made.conformal.scores)
         new, seen = draw_hard_and_easy(2000, rng)
         own = new.present
         assert new.nonconformity is not None
@@ -235,6 +237,8 @@ def test_few_frames_are_one_group() -> None:
     assert choose_edges(np.linspace(0, 1, 41)) == pytest.approx((0.5,))
     assert choose_edges(np.linspace(0, 1, 199)) == pytest.approx((0.25, 0.5, 0.75))
     assert choose_edges(np.linspace(0, 1, 200)) == pytest.approx((0.1, 0.25, 0.45, 0.7))
+    assert choose_edges(np.linspace(0, 1, 399)) == pytest.approx((0.1, 0.25, 0.45, 0.7))
+    assert choose_edges(np.linspace(0, 1, 400)) == pytest.approx((0.05, 0.15, 0.25, 0.45, 0.7))
     assert len(choose_edges(np.zeros(400))) == 1  # all alike: no limit tells them apart
 
 

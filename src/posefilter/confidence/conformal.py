@@ -41,11 +41,14 @@ import numpy as np
 By = Literal["surface", "probability"]
 GROUPED_BY: tuple[str, ...] = get_args(By)
 _FEWEST = 20  # frames of a group: with as many, a set of 95 % is not that of all poses
-# of the frames, below each limit between groups: the surest are much alike, the others are not
-_SHARES = (0.1, 0.25, 0.45, 0.7)
+# of the frames, below each limit between groups: the surest are much alike, the others are not; the
+# finest for which the frames suffice
+_SHARES = ((0.05, 0.15, 0.25, 0.45, 0.7), (0.1, 0.25, 0.45, 0.7))
 _EVEN = 4  # groups at most where frames are too few for these
 LITTLE_VISIBLE = 0.25  # a frame with less counts for the second limit of its group
-_FEWEST_OCCLUDED = 5  # frames of a group that a second limit takes at least
+# that a second limit takes at least: frames of a group, and their share of it, since where they are
+# rare it would only make the sets of all others larger
+_FEWEST_OCCLUDED, _LEAST_OCCLUDED = 5, 0.2
 # of the feature `surface`: about half of an object's surface faces the camera, so that below a
 # quarter the depth shows less than half of what could be seen
 EDGES = (0.25,)
@@ -84,9 +87,9 @@ class Conformal:
             occluded frames count where they are enough for the level.
         """
         group = self.find_group(value)
-        limit = _find_quantile(self.scores[group], level)
-        occluded = self.occluded[group] if self.occluded else ()
-        if len(occluded) < _FEWEST_OCCLUDED:
+        own, occluded = self.scores[group], self.occluded[group] if self.occluded else ()
+        limit = _find_quantile(own, level)
+        if len(occluded) < max(_FEWEST_OCCLUDED, _LEAST_OCCLUDED * len(own)):
             return limit
         second = _find_quantile(occluded, level)
         return limit if math.isinf(second) else max(limit, second)
@@ -99,16 +102,17 @@ def _find_quantile(scores: Sequence[float], level: float) -> float:
 
 
 def choose_edges(probability: np.ndarray) -> tuple[float, ...]:
-    """Return limits between five groups, of 10, 15, 20, 25 and 30 % of the frames.
+    """Return limits between six groups, of 5, 10, 10, 20, 25 and 30 % of the frames.
 
-    Below 200 frames there are fewer groups, of as many frames each, and of 20 at least.
+    Below 400 frames there are five, of 10, 15, 20, 25 and 30 %, and below 200 fewer, of as many
+    frames each, and of 20 at least.
 
     (n,) probabilities of the frames.
     """
     count = len(probability)
     even = max(1, min(_EVEN, count // _FEWEST))
-    enough = round(_SHARES[0] * count, 6) >= _FEWEST
-    shares = _SHARES if enough else tuple(k / even for k in range(1, even))
+    enough = [shares for shares in _SHARES if round(shares[0] * count, 6) >= _FEWEST]
+    shares = enough[0] if enough else tuple(k / even for k in range(1, even))
     return tuple(float(one) for one in np.unique(np.quantile(probability, shares)))
 
 
