@@ -83,13 +83,13 @@ def test_frames_of_unknown_visibility_are_not_occluded() -> None:
 def test_sets_hold_the_truth_of_occluded_frames_that_the_probability_does_not_tell(
     level: float,
 ) -> None:
-    """Of a group's frames a fifth are harder, and nothing that a new frame shows says which."""
+    """Of a group's frames a third are harder, and nothing that a new frame shows says which."""
     rng = np.random.default_rng(5)
     covered: dict[bool, dict[bool, list[bool]]] = {
         known: {True: [], False: []} for known in (True, False)
     }
     for _ in range(300):
-        seen = rng.choice([0.1, 0.9], size=161, p=[0.2, 0.8])
+        seen = rng.choice([0.1, 0.9], size=161, p=[0.3, 0.7])
         scores = rng.normal(size=161) + np.where(seen < 0.25, 3.0, 0.0)
         for known, own in covered.items():
             values = np.full(160, 0.5)
