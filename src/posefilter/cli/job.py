@@ -26,7 +26,7 @@ _NEEDED = {
         *("max_time_difference", "copy_messages", "depth_scale"),
         *("cost_false_alarm", "cost_miss", "cost_unsure"),
     ),
-    "calibrate": ("frames", "seed", "overwrite"),
+    "calibrate": ("frames", "seed", "overwrite", "sets_only"),
     "track": ("stride", "fps", "seed", "out", "tracker"),
     "generate": ("seed",),
     "check_data": ("data", "out"),

@@ -27,7 +27,7 @@ _FOLDERS = {
 _ONE_IMAGE = "is a folder; predict takes one image, and track frames=DIR a folder of them"
 _IS_FOLDER = {"rgb": _ONE_IMAGE, "depth": _ONE_IMAGE, "estimates": "is a folder; name a file in it"}
 _SWITCHES = {
-    "calibrate": ("overwrite",),
+    "calibrate": ("overwrite", "sets_only"),
     "convert_bag": ("rectify", "track", "copy_messages"),
     "export": ("quantize",),
     "generate": ("stereo", "settle", "progress"),
