@@ -71,10 +71,10 @@ def read_runs(folder: Path) -> list[Run]:
             name_today(text.lstrip("+~")) for text in run.get("overrides") or [] if "=" in text
         ]
         run["choices"] = dict(text.split("=", 1) for text in typed)
-        # a test on other data is of the row that its checkpoint is of
-        of = re.search(r"\bablation=(\w+)", run.get("checkpoint") or "")
+        # a test on other data is of the row and the seed that its checkpoint is of
+        of = re.search(r"\bablation=(\w+),.*\bseed=(\d+)", run.get("checkpoint") or "")
         if of and "data" in run["choices"]:
-            run["choices"]["ablation"] = of[1]
+            run["choices"]["ablation"], run["seed"] = of[1], int(of[2])
         runs.append(run)
     return runs
 
