@@ -13,7 +13,7 @@ every = pytest.mark.parametrize("info", METRICS.values(), ids=METRICS.keys())
 
 STORED_AS_PERCENT = r"auc$|recall|/ar$|/ar_|coverage|score$"
 WITHIN_ONE = r"iou$|auroc"  # from 0 to 1
-WITHIN_SIGNED_ONE = r"cosine$|_r2$|heading$"  # from -1 to 1
+WITHIN_SIGNED_ONE = r"cosine$|heading$"  # from -1 to 1; R² has no least
 COUNTS = (
     "instances", "missed", "confidence/frames", "confidence/frames_without",
     "confidence/false_alarms", "apparent_size/images", "apparent_size/contradicting",
@@ -66,7 +66,8 @@ def test_the_digits_are_those_that_mean_something(info: MetricInfo) -> None:
     elif info.limits and info.limits[1] < 2:
         assert info.format(0.5) in ("0.50", "0.500")
     elif (
-        info.key in ("belief/rank", "belief/entropy", "apparent_size/ratio")
+        info.key
+        in ("belief/rank", "belief/entropy", "apparent_size/ratio", "diagnostics/offset_r2")
         or "log_density" in info.key
     ):
         assert info.format(0.5) == "0.50"
