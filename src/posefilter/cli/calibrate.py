@@ -31,7 +31,7 @@ from posefilter.confidence.belief_scale import (
     fit_belief_scale,
     measure_spread,
 )
-from posefilter.confidence.calibration import Assessment, Calibration, standardize
+from posefilter.confidence.calibration import Assessment, Calibration
 from posefilter.confidence.conformal import LITTLE_VISIBLE, choose_edges, fit_conformal
 from posefilter.confidence.fit import (
     FEWEST,
@@ -263,17 +263,15 @@ def learn_sets(method: PoseEstimator, present: Sequence[FrameDataset], console: 
         present: Frames with the object, of none that the calibration is of.
         console: "rich" or "json".
     """
-    calibration, model = method.calibration, method.object_model
+    calibration = method.calibration
     assert calibration is not None
     frames, (beliefs, truth), _ = collect_frames(method, present, [], console)
-    values = frames.values[:, [frames.features.index(name) for name in calibration.features]]
-    probability = calibration.assess_features(torch.from_numpy(values)).probability
-    if calibration.belief_scale is not None:
-        x = torch.from_numpy(standardize(values, calibration.center, calibration.scale))
-        beliefs, _ = calibrate_belief(beliefs, probability, x, calibration.belief_scale, model)
-    scores, held = score_truth(beliefs, truth, model).nonconformity.numpy(), probability.numpy()
-    edges = choose_edges(held)
-    sets = fit_conformal(scores, held, edges, "probability", frames.visibility)
+    columns = torch.from_numpy(frames.values.T)
+    found = calibration.assess(dict(zip(frames.features, columns, strict=True)))
+    beliefs, _ = method.calibrate_belief(beliefs, found)
+    scores = score_truth(beliefs, truth, method.object_model).nonconformity.numpy()
+    held = found.probability.numpy()
+    sets = fit_conformal(scores, held, choose_edges(held), "probability", frames.visibility)
     return replace(calibration, conformal=sets)
 
 

@@ -95,7 +95,8 @@ class Tally:
     def add(self, frame: BagFrame, results: Sequence[Result], console: str) -> None:
         """Count an image, and say what makes its results doubtful."""
         self.images += 1
-        self.blank += bool(find_blank(frame.rgb, frame.depth))
+        # single images that are blank have no results, and tracks say that they are
+        self.blank += not results or bool(results[0].blank)
         shown = {one.object for one in list_shown(results)}
         for one in results:
             self.found[one.object] += one.object in shown

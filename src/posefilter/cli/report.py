@@ -60,20 +60,21 @@ def report(job: Job) -> None:
         if job.cfg.out
         else folder / ("comparison" if kind == "runs" else "report")
     )
-    if not job.cfg.out:  # the folder is this command's own
-        for chart in out.glob("*.png"):
-            chart.unlink()
     charts = write_page(page, out)
-    ended(job.cfg.console, "reported", {"report": out / "report.html", f"{charts} charts": out})
+    if not job.cfg.out:  # the folder is this command's own: what an earlier page had goes
+        for earlier in {*out.glob("*.png")} - {out / name for name in charts}:
+            earlier.unlink()
+    files = {"report": out / "report.html", f"{len(charts)} charts": out}
+    ended(job.cfg.console, "reported", files)
 
 
-def write_page(page: Page, folder: Path) -> int:
-    """Write a page, and its charts as pictures; return how many there are."""
+def write_page(page: Page, folder: Path) -> list[str]:
+    """Write a page, and its charts as pictures; return their names."""
     write_whole(folder / "report.html", page.render())
     files = page.files()
     for name, png in files.items():
         write_whole(folder / name, png)
-    return len(files)
+    return [*files]
 
 
 def with_todays_names(run: Run) -> Run:

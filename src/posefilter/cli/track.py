@@ -63,6 +63,12 @@ def track(job: Job) -> None:
     estimator = Estimator(methods_of(cfg.checkpoint, changes(cfg)))
     check_once(estimator.objects)
     videos, native = open_videos(cfg, estimator.objects)
+    longest = max(map(len, videos))
+    if cfg.save_video == "gif" and longest > _MOST_IN_GIF:
+        raise UserError(
+            f"save_video=gif: {longest} frames do not fit into memory (at most {_MOST_IN_GIF}); "
+            "choose save_video=mp4, or a stride="
+        )
     store = open_shapes(cfg, estimator.objects)
     shapes = {model.name: load_shape(store, model) for model in estimator.object_models}
     folder.mkdir(parents=True, exist_ok=True)
@@ -132,11 +138,6 @@ def follow(
         return
     tracker = Tracker(Estimator(methods), settings, cfg.seed, threads)
     say(cfg.console, "video", f"{video.name}: {len(video)} frames", video=video.name)
-    if cfg.save_video == "gif" and len(video) > _MOST_IN_GIF:
-        raise UserError(
-            f"save_video=gif: {len(video)} frames do not fit into memory (at most {_MOST_IN_GIF}); "
-            "choose save_video=mp4, or a stride="
-        )
     for name in video.several:
         sentence = (
             f"{video.name}: frames show several of {name}; one is tracked, and compared with the "
@@ -150,10 +151,8 @@ def follow(
         task, room = bar.add_task(video.name, total=len(video)), 0
         for frame in read_frames(video, tracker, cfg):
             results = tracker.update_all(frame.rgb, frame.depth, frame.intrinsics)
-            picture = draw_frame(frame, results, shapes)
             room = room or measure_room(frame, results, shapes)
-            missing = ((0, max(0, room - len(picture))), (0, 0), (0, 0))
-            writer.add(np.pad(picture, missing, constant_values=255))
+            writer.add(draw_frame(frame, results, shapes), room)
             recorder.add(frame.rgb, frame.depth, frame.intrinsics, list_seen(results))
             rows = []
             for result in results:

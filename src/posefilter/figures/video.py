@@ -42,9 +42,10 @@ class VideoWriter:
         self._level = logging.setLogLevel(logging.LOG_LEVEL_SILENT)
         return self
 
-    def add(self, picture: np.ndarray) -> None:
+    def add(self, picture: np.ndarray, min_height: int = 0) -> None:
         """Add a picture (H, W, 3) uint8; later ones are brought to the first one's width, and cut
-        or filled with white below to its height, since what they show must not be squeezed.
+        or filled with white below to its height, or to `min_height` if that is more, since what
+        they show must not be squeezed.
 
         Raises:
             UserError: This OpenCV cannot encode videos.
@@ -52,7 +53,7 @@ class VideoWriter:
         if self.form == "none":
             return
         if self._size is None:
-            rows, columns = picture.shape[:2]
+            rows, columns = max(min_height, picture.shape[0]), picture.shape[1]
             scale = min(1.0, _GIF_WIDTH / columns) if self.form == "gif" else 1.0
             # even, as codecs want it
             self._size = (2 * round(scale * columns / 2), 2 * round(scale * rows / 2))

@@ -20,7 +20,6 @@ from posefilter.meshes.mesh import (
 # [m] across: what is larger or smaller is likely in another unit than meters
 LARGEST, SMALLEST = 2.0, 0.01
 _COMMON = 0.2  # [m] likely units are told in the order of how near they come to it
-_UNITS = {"centimeters": 0.01, "millimeters": 0.001, "inches": 0.0254}
 _COARSE = 0.5  # [px / mm] of texture
 
 
@@ -74,7 +73,9 @@ def check_size(facts: MeshFacts, source: str) -> None:
     across = facts.diameter_mm / 1000
     if SMALLEST <= across <= LARGEST:
         return
-    nearest = sorted(_UNITS.items(), key=lambda unit: abs(math.log(across * unit[1] / _COMMON)))
+    nearest = sorted(
+        store.UNITS.items(), key=lambda unit: abs(math.log(across * unit[1] / _COMMON))
+    )
     fitting = [
         f"mesh_scale={scale:g} ({unit}: {1000 * across * scale:.0f} mm across)"
         for unit, scale in nearest

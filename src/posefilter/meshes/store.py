@@ -38,7 +38,7 @@ log = logging.getLogger(__name__)
 # [m] the unit of an object that is larger or smaller must be wrong
 LARGEST, SMALLEST = 10.0, 1e-3
 BUILTIN = "builtin"
-_OTHERS = ", or 0.01 of centimeters, 0.0254 of inches"
+UNITS = {"millimeters": 0.001, "centimeters": 0.01, "inches": 0.0254}  # [m] of meshes, most first
 
 
 class WrongUnit(UserError):  # noqa: N818
@@ -286,6 +286,10 @@ def _check_unit(mesh: Mesh, path: Path, scale: float) -> None:
     if SMALLEST <= across <= LARGEST:
         return
     if across > LARGEST:
-        raise WrongUnit(path, across, "the mesh is probably in millimeters", 0.001 * scale, _OTHERS)
+        usual, *rare = UNITS.items()
+        others = "".join(f", {unit:g} of {name}" for name, unit in rare).replace(",", ", or", 1)
+        raise WrongUnit(
+            path, across, f"the mesh is probably in {usual[0]}", usual[1] * scale, others
+        )
     guess = "in kilometers" if scale == 1 else f"in meters, and taken as {scale:g} m a unit"
     raise WrongUnit(path, across, f"the mesh is probably {guess}", 1000 * scale)
