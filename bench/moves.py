@@ -1,4 +1,4 @@
-"""Compare the filter with and without Markov moves and islands on rendered frames: time, coverage
+"""Compare the filter with and without Markov moves and niches on rendered frames: time, coverage
 of the credible sets, and log density of the truth.
 
     python bench/moves.py --root DIR --meshes DIR [--frames 60] [--minutes 3] [--out FILE.json]
@@ -29,7 +29,7 @@ from posefilter.metrics.credibility import SHOWN, measure_coverage, score_truth
 from posefilter.types import Batch
 
 MOVES = "filter/refine=mean_shift_and_resample_move"
-WAYS = {"default": [], "moves": [MOVES], "islands, moves": ["filter/resample=islands", MOVES]}
+WAYS = {"default": [], "moves": [MOVES], "niches, moves": ["filter/resample=niches", MOVES]}
 HEAD = ["way", "frames", "seconds, median", "over the default", "coverage of credible sets"]
 HEAD += ["log density, mean", "median"]
 

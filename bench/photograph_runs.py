@@ -44,6 +44,7 @@ SIXTH_SPLIT = "data.split={train: 0.96, val: 0.02, test: 0.02}"
 SIXTH_RUNS = {
     "mustard": (2006, 2800, 7000), "tuna": (2007, 2800, 7000),
     "chef": (2002, 2000, 4000), "gelatin": (2009, 2000, 4000),
+    "drill": (2035, 2800, 7000), "banana": (2011, 2800, 7000),
 }  # fmt: skip
 
 

@@ -9,8 +9,8 @@ of its own, with other poses, widths, correlations and masses, and its own seed.
 with any rotation and within 10 cm, and is annealed as pose_pf is.
 
 Ways: `search` weights as the filter does by default (`filter/reweight=current_likelihood`), which
-reads the likelihood at every step; `islands` does too, and resamples within islands
-(`filter/resample=islands`); `tempered` counts it once (`likelihood_ratio`); `drawn anew` is a last
+reads the likelihood at every step; `islands` and `niches` do too, and resample within islands
+(`filter/resample=islands`) or niches (`filter/resample=niches`); `tempered` counts it once (`likelihood_ratio`); `drawn anew` is a last
 pass of importance sampling (`filter/refine=mean_shift_and_importance`); `moved` adds moves that
 leave the posterior unchanged (`filter/refine=mean_shift_and_resample_move`).  `exact draws` are
 what a perfect sampler would give: their gap is the kernel density's own.
@@ -37,6 +37,7 @@ from posefilter.belief import Belief
 from posefilter.filters.estimate import Argmax
 from posefilter.filters.importance import ImportanceSampling
 from posefilter.filters.loop import ParticleFilter
+from posefilter.filters.niches import Niches
 from posefilter.filters.propagate import Gaussian
 from posefilter.filters.refine import Compose, NoRefine
 from posefilter.filters.resample import Islands, Systematic
@@ -46,7 +47,7 @@ from posefilter.filters.schedule import Geometric
 from posefilter.geometry.pose import make_pose, rotation_of
 from posefilter.geometry.rotation import angle_between, random_rotation
 from posefilter.geometry.spaces import PoseSpace
-from posefilter.protocols import Refine
+from posefilter.protocols import Refine, Resample
 from posefilter.types import ParticleOutput, Particles, Step
 
 RADIUS = 0.1  # [m]
@@ -96,13 +97,19 @@ def start(batch: Any, scene: None, method: Toy, count: int, generator: Generator
     return make_pose(turn, method.posterior.middle[:3, 3] + shift)
 
 
+def make_resample(way: str) -> Resample:
+    """Return the resampling of one of `WAYS`."""
+    if "niches" in way:
+        return Niches()
+    return Islands(Systematic()) if "islands" in way else Systematic()
+
+
 def make_refine(way: str, particles: int) -> Refine:
     """Return the last pass of one of `WAYS`."""
     if way.endswith("drawn anew"):
         return ImportanceSampling(particles, 3)
     if way.endswith("moved"):
-        middle = ImportanceSampling(particles, 1, widening=1.5)
-        return Compose([ResampleMove(4), middle, ResampleMove(8)])
+        return Compose([ImportanceSampling(particles, 4, equal_modes=True), ResampleMove(8)])
     return NoRefine()
 
 
@@ -127,7 +134,7 @@ def run(posterior: Posterior, particles: int, seed: int, way: str) -> tuple[Beli
         initialize=start,
         schedule=Geometric(FIRST, LAST),
         reweight=CurrentLikelihood() if not way.startswith("tempered") else LikelihoodRatio(),
-        resample=Islands(Systematic()) if "islands" in way else Systematic(),
+        resample=make_resample(way),
         propagate=Gaussian(0.5),
         estimate=Argmax(),
         refine=make_refine(way, particles),
@@ -139,8 +146,8 @@ def run(posterior: Posterior, particles: int, seed: int, way: str) -> tuple[Beli
 
 
 WAYS = (
-    "search", "search, drawn anew", "search, moved", "islands", "islands, moved", "tempered",
-    "tempered, moved", "exact draws",
+    "search", "search, drawn anew", "search, moved", "islands", "islands, moved", "niches",
+    "niches, moved", "tempered", "tempered, moved", "exact draws",
 )  # fmt: skip
 POSTERIORS: dict[str, Callable[[int], Posterior]] = {
     "Gaussian": make_gaussian,

@@ -199,7 +199,7 @@ RANGES: dict[str, Range] = {
     "propagate.noise_scale": Range(0, 100),
     "uniform_angle_probability": SHARE,
     **_each("resample", SHARE, "alpha", "threshold"),
-    **_each("resample", COUNT, "iterations", "size"),
+    **_each("resample", COUNT, "iterations", "size", "niches"),
     "resample.epsilon": POSITIVE,
     "resample.floor": Range(0, 1, above=True),
     **_each("estimate", POSITIVE, "bandwidth", "radius"),

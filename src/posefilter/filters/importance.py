@@ -31,6 +31,9 @@ class ImportanceSampling:
     more. A second round draws from the density of the first one's weighted particles (population
     Monte Carlo, Cappe et al. 2004). The estimate and its score are kept.
 
+    The masses of the search's modes are no guide: with `equal_modes` the first round draws as often
+    from each, so that one of little mass, or of much that the search missed, is weighed as well.
+
     Args:
         samples: Particles of a round.
         rounds: Number of rounds.
@@ -38,6 +41,7 @@ class ImportanceSampling:
         temperature: T; 1 takes the likelihood at its word, more makes the belief wider.
         sigma: Noise level of the likelihood [m].
         pixels: Image points that each particle is scored from, the same for all.
+        equal_modes: Whether the first density gives each mode the same mass.
 
     Raises:
         UserError: A number is out of range.
@@ -51,6 +55,7 @@ class ImportanceSampling:
     temperature: float = 1.0
     sigma: float = 0.004
     pixels: int = 256
+    equal_modes: bool = False
 
     def __post_init__(self) -> None:
         counts, widening, temperature = (self.samples, self.rounds), self.widening, self.temperature
@@ -67,8 +72,8 @@ class ImportanceSampling:
         """Return the belief with new particles; without gradient."""
         poses, log_weights = belief.poses, belief.log_weights
         for number in range(self.rounds):
-            widening = self.widening if number == 0 else 1.0
-            poses, log_q = self.propose(poses, log_weights, method, widening, generator)
+            widening, equal = (self.widening, self.equal_modes) if number == 0 else (1.0, False)
+            poses, log_q = self.propose(poses, log_weights, method, widening, generator, equal)
             score = scorer_of(method).score_poses(
                 encoding, poses, self.sigma, generator, self.pixels
             )
@@ -82,6 +87,7 @@ class ImportanceSampling:
         method: Method,
         widening: float,
         generator: Generator,
+        equal_modes: bool,
     ) -> tuple[Tensor, Tensor]:
         """Draw particles from the density of others.
 
@@ -91,6 +97,7 @@ class ImportanceSampling:
             method: Its space knows the object's center and size.
             widening: Factor of the kernels.
             generator: Source of randomness.
+            equal_modes: Whether each mode of the density has the same mass.
 
         Returns:
             Particles (B, samples, 4, 4), and their log density (B, samples), float64.
@@ -102,7 +109,11 @@ class ImportanceSampling:
         for particles, weights in zip(poses, log_weights, strict=True):
             # of a density's background alone the diameter counts: twice the radius will do
             diameter = 2 * space.radius
-            member = find_pose_modes(particles, weights, space, diameter).member
+            modes = find_pose_modes(particles, weights, space, diameter)
+            member = modes.member
+            if equal_modes:
+                mass = modes.weights.to(weights)[member]
+                weights = (weights - mass.log()).log_softmax(0)
             density = fit_density(particles, weights, center, space.radius, diameter, member=member)
             density = widen(density, widening)
             drawn.append(draw_poses(density, self.samples, generator))
