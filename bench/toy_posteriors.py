@@ -10,10 +10,11 @@ with any rotation and within 10 cm, and is annealed as pose_pf is.
 
 Ways: `search` weights as the filter does by default (`filter/reweight=current_likelihood`), which
 reads the likelihood at every step; `islands` and `niches` do too, and resample within islands
-(`filter/resample=islands`) or niches (`filter/resample=niches`); `tempered` counts it once (`likelihood_ratio`); `drawn anew` is a last
-pass of importance sampling (`filter/refine=mean_shift_and_importance`); `moved` adds moves that
-leave the posterior unchanged (`filter/refine=mean_shift_and_resample_move`).  `exact draws` are
-what a perfect sampler would give: their gap is the kernel density's own.
+(`filter/resample=islands`) or niches (`filter/resample=niches`); `tempered` counts it once
+(`likelihood_ratio`); `drawn anew` is a last pass of importance sampling
+(`filter/refine=mean_shift_and_importance`); `moved` does so in more rounds, and adds moves that leave the
+posterior unchanged (`filter/refine=mean_shift_and_resample_move`).  `exact draws`
+are what a perfect sampler would give: their gap is the kernel density's own.
 
 Truths are drawn from the posterior.  `gap` is the mean log density that the exact posterior has at
 them less that of the belief, over runs and truths; `mass` is the mean error of the first mode's
@@ -109,7 +110,7 @@ def make_refine(way: str, particles: int) -> Refine:
     if way.endswith("drawn anew"):
         return ImportanceSampling(particles, 3)
     if way.endswith("moved"):
-        return Compose([ImportanceSampling(particles, 4, equal_modes=True), ResampleMove(8)])
+        return Compose([ImportanceSampling(particles, 5, min_effective=0.2), ResampleMove(8)])
     return NoRefine()
 
 

@@ -212,7 +212,7 @@ RANGES: dict[str, Range] = {
     **_each("refine", METERS, "sigma", "initial_scale", "final_scale", "texture_error", "gate"),
     **_each("refine", METERS, "initial_gate", "final_gate", "prior", "noise"),
     **_each("refine", POSITIVE, "temperature", "effective", "independent"),
-    **_each("refine", SHARE, "rotation_probability", "min_correlation"),
+    **_each("refine", SHARE, "rotation_probability", "min_correlation", "min_effective"),
     **_each("refine", WEIGHT, "learned_weight", "min_gain"),
     "refine.top_k": _whole(0, 100_000),
     "refine.steps": COUNT_OR_NONE,

@@ -126,16 +126,10 @@ def test_only_the_density_of_the_search_is_widened() -> None:
 
     class Watched(ImportanceSampling):
         def propose(
-            self,
-            poses: Tensor,
-            weights: Tensor,
-            method: Any,
-            widening: float,
-            generator: Generator,
-            equal_modes: bool,
+            self, poses: Tensor, weights: Tensor, method: Any, widening: float, generator: Generator
         ) -> tuple[Tensor, Tensor]:
             seen.append(widening)
-            return super().propose(poses, weights, method, widening, generator, equal_modes)
+            return super().propose(poses, weights, method, widening, generator)
 
     Watched(20, 3, widening=1.5)(search_result(), None, Known(), Generator().manual_seed(0))  # type: ignore[arg-type]
     assert seen == [1.5, 1.0, 1.0]

@@ -10,6 +10,7 @@ from torch import Generator, Tensor
 from posefilter.errors import UserError
 from posefilter.filters.auxiliary import AuxiliaryResampling
 from posefilter.filters.loop import inherit, make_particles
+from posefilter.filters.niches import Niches
 from posefilter.filters.resample import (
     AdaptiveResampling,
     InverseCDF,
@@ -37,6 +38,7 @@ RESAMPLERS = {
     "soft": Soft(0.5),
     "adaptive": AdaptiveResampling(Systematic(), 0.5),
     "islands": Islands(Systematic(), 8),
+    "niches": Niches(8),
     "sampled transport": SampledTransport(),
     "ensemble transform": EnsembleTransform(),
 }
@@ -61,7 +63,8 @@ def parents_share(resampled: Resampled, count: int) -> Tensor:
 @every
 @pytest.mark.parametrize("count", [40, 25, 90])
 def test_weights_are_kept_in_expectation(resampler: Resample, count: int) -> None:
-    rows, noise = (200, 0.015) if isinstance(resampler, SampledTransport) else (4000, 0.004)
+    slow = isinstance(resampler, SampledTransport | Niches)
+    rows, noise = (200, 0.015) if slow else (4000, 0.004)
     particles = cloud_of(rows, 40)
     resampled = resampler(particles, count, SPACE, Generator().manual_seed(1))
     assert resampled.ancestors.shape == resampled.log_weights.shape == (rows, count)
@@ -281,6 +284,40 @@ def test_islands_keep_a_mode_that_one_population_loses() -> None:
         kept[name] = float(((share > 0) & (share < 1)).float().mean())
     assert kept["one"] < 0.5
     assert kept["islands"] > 0.9
+
+
+def test_niches_keep_the_narrow_mode_that_annealing_loses() -> None:
+    """A wide mode and a narrow one of equal mass, 20 apart: the narrow one's share of a flat
+    likelihood is a fiftieth, and 60 particles are one of it.
+    """
+    kept = {}
+    for name, scheme in (("one", Systematic()), ("niches", Niches(6))):
+        g = Generator().manual_seed(5)
+        state = torch.randn(100, 60, 2, generator=g) * 2.0
+        state[:, 0] = torch.tensor([20.0, 0.3])
+        for power in torch.logspace(-2, 0, 12):
+            wide = -0.5 * (state / 2.0).square().sum(-1)
+            narrow = -0.5 * ((state - torch.tensor([20.0, 0.0])) / 0.2).square().sum(-1)
+            log_w = torch.log_softmax(power * torch.logaddexp(wide, narrow), 1)
+            particles = make_particles(state, 0)._replace(log_weights=log_w)
+            state = inherit(state, scheme(particles, 60, SPACE, g), SPACE)
+            state = state + 0.05 * torch.randn(state.shape, generator=g)
+        share = (state[..., 0] > 10).float().mean(1)
+        kept[name] = float((share > 0).float().mean())
+    assert kept["one"] < 0.7
+    assert kept["niches"] == 1.0
+
+
+def test_niches_have_equally_many_children_about_the_peaks() -> None:
+    state = torch.tensor([0.0, 0.1, 5.0, 5.1, 9.0, 9.1])[None, :, None].repeat(1, 1, 2)
+    log_w = torch.tensor([[0.4, 0.2, 0.2, 0.1, 0.06, 0.04]]).log()
+    particles = make_particles(state, 0)._replace(log_weights=log_w)
+    new = Niches(3)(particles, 30, SPACE, Generator().manual_seed(0))
+    place = state[0, new.ancestors[0], 0].round()
+    for where, mass in ((0.0, 0.6), (5.0, 0.3), (9.0, 0.1)):
+        assert int((place == where).sum()) == 10
+        own = new.log_weights[0, place == where].exp()
+        torch.testing.assert_close(own, torch.full((10,), mass / 10))
 
 
 def test_an_island_is_not_empty() -> None:

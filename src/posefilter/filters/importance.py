@@ -10,10 +10,13 @@ from posefilter.capabilities import Capabilities
 from posefilter.errors import UserError
 from posefilter.filters.modes import find_pose_modes
 from posefilter.filters.refine import scorer_of
+from posefilter.filters.resample import effective_sample_size
 from posefilter.geometry.pose_density import draw_poses, fit_density, log_density, widen
 from posefilter.geometry.spaces import PoseSpace
 from posefilter.protocols import Encoding, Method
 from posefilter.types import BeliefBatch
+
+_HALVINGS = 30  # of the interval of a power
 
 
 @dataclass(eq=False)
@@ -31,8 +34,10 @@ class ImportanceSampling:
     more. A second round draws from the density of the first one's weighted particles (population
     Monte Carlo, Cappe et al. 2004). The estimate and its score are kept.
 
-    The masses of the search's modes are no guide: with `equal_modes` the first round draws as often
-    from each, so that one of little mass, or of much that the search missed, is weighed as well.
+    Where the old particles lie beside a narrow mode, a few have nearly all of the weight, and the
+    next density would be of these alone. Therefore weights that the next round draws by are
+    tempered: taken to the power, 1 at most, that leaves an effective sample size of
+    `min_effective` (nonlinear weights: Koblents and Miguez 2015). The last round's are as they are.
 
     Args:
         samples: Particles of a round.
@@ -41,7 +46,8 @@ class ImportanceSampling:
         temperature: T; 1 takes the likelihood at its word, more makes the belief wider.
         sigma: Noise level of the likelihood [m].
         pixels: Image points that each particle is scored from, the same for all.
-        equal_modes: Whether the first density gives each mode the same mass.
+        min_effective: Least effective sample size of the weights that a round draws by, over the
+            number of particles; 0 leaves them as they are.
 
     Raises:
         UserError: A number is out of range.
@@ -55,7 +61,7 @@ class ImportanceSampling:
     temperature: float = 1.0
     sigma: float = 0.004
     pixels: int = 256
-    equal_modes: bool = False
+    min_effective: float = 0.0
 
     def __post_init__(self) -> None:
         counts, widening, temperature = (self.samples, self.rounds), self.widening, self.temperature
@@ -72,8 +78,10 @@ class ImportanceSampling:
         """Return the belief with new particles; without gradient."""
         poses, log_weights = belief.poses, belief.log_weights
         for number in range(self.rounds):
-            widening, equal = (self.widening, self.equal_modes) if number == 0 else (1.0, False)
-            poses, log_q = self.propose(poses, log_weights, method, widening, generator, equal)
+            widening = self.widening if number == 0 else 1.0
+            if self.min_effective:
+                log_weights = temper(log_weights, self.min_effective)
+            poses, log_q = self.propose(poses, log_weights, method, widening, generator)
             score = scorer_of(method).score_poses(
                 encoding, poses, self.sigma, generator, self.pixels
             )
@@ -87,7 +95,6 @@ class ImportanceSampling:
         method: Method,
         widening: float,
         generator: Generator,
-        equal_modes: bool,
     ) -> tuple[Tensor, Tensor]:
         """Draw particles from the density of others.
 
@@ -97,7 +104,6 @@ class ImportanceSampling:
             method: Its space knows the object's center and size.
             widening: Factor of the kernels.
             generator: Source of randomness.
-            equal_modes: Whether each mode of the density has the same mass.
 
         Returns:
             Particles (B, samples, 4, 4), and their log density (B, samples), float64.
@@ -109,13 +115,31 @@ class ImportanceSampling:
         for particles, weights in zip(poses, log_weights, strict=True):
             # of a density's background alone the diameter counts: twice the radius will do
             diameter = 2 * space.radius
-            modes = find_pose_modes(particles, weights, space, diameter)
-            member = modes.member
-            if equal_modes:
-                mass = modes.weights.to(weights)[member]
-                weights = (weights - mass.log()).log_softmax(0)
+            member = find_pose_modes(particles, weights, space, diameter).member
             density = fit_density(particles, weights, center, space.radius, diameter, member=member)
             density = widen(density, widening)
             drawn.append(draw_poses(density, self.samples, generator))
             log_q.append(log_density(density, drawn[-1]))
         return torch.stack(drawn).to(poses), torch.stack(log_q)
+
+
+def temper(log_weights: Tensor, least: float) -> Tensor:
+    """Return the weights to the highest power, 1 at most, that keeps them even enough.
+
+    Args:
+        log_weights: (B, N), normalized.
+        least: Effective sample size that they are to have at least, over N.
+
+    Returns:
+        (B, N), normalized.
+    """
+    # of no weight at all every power is none, but the power 0
+    log_weights = log_weights.clamp_min(0.5 * torch.finfo(log_weights.dtype).min)
+    low, high = torch.zeros_like(log_weights[:, :1]), torch.ones_like(log_weights[:, :1])
+    power = high
+    for _ in range(_HALVINGS):
+        tempered = (power * log_weights).log_softmax(1)
+        enough = effective_sample_size(tempered)[:, None] >= least * log_weights.shape[1]
+        low, high = torch.where(enough, power, low), torch.where(enough, high, power)
+        power = (low + high) / 2
+    return (low * log_weights).log_softmax(1)
