@@ -166,8 +166,11 @@ def as_array(value: Any, name: str) -> np.ndarray:
     if isinstance(value, np.ma.MaskedArray):
         return np.asarray(value.filled(0))  # masked depth is unknown
     if isinstance(value, torch.Tensor):
-        plain = value.detach().cpu()
+        plain = value.detach().to_dense().cpu()
         return np.asarray((plain.float() if plain.dtype == torch.bfloat16 else plain).numpy())
+    if isinstance(value, list | tuple):  # of masked arrays, or of tensors with a gradient, too
+        parts = (np.ma.MaskedArray, torch.Tensor)
+        value = [as_array(one, name) if isinstance(one, parts) else one for one in value]
     try:
         return np.asarray(value)
     except ValueError as error:  # a list of arrays of unequal shape
@@ -234,7 +237,11 @@ def _check_depth(depth: np.ndarray, empty: bool) -> np.ndarray:
             raise UserError(f"depth{which}: no pixel has depth")
         median = float(np.median(one[one > 0]))
         if not _NEAREST < median < _FARTHEST:
-            raise UserError(f"depth{which}: the median would be {median:.3g} m; is it in meters?")
+            near = np.mean((depth[number] > 0) & (depth[number] < BEYOND))
+            where = f" ({near:.1%} of it is within {BEYOND:g} m)" if 0 < near < _FEWEST else ""
+            raise UserError(
+                f"depth{which}: the median would be {median:.3g} m; is it in meters?{where}"
+            )
     return z
 
 

@@ -11,6 +11,7 @@ from torch import Tensor
 sys.path.insert(0, str(Path(__file__).parent))
 from test_image_space import working
 
+from posefilter.errors import UserError
 from posefilter.models.cnn_patch import CnnPatch
 from posefilter.models.image_space import ImageSpace
 from posefilter.models.muon import Muon
@@ -70,3 +71,10 @@ def test_a_training_that_only_loses_its_gradients_ends() -> None:
         FloatingPointError, match="gradient of net was not finite in 20 steps in a row"
     ):
         taught(method, optimizer, math.nan)
+
+
+def test_another_way_of_clipping_is_refused() -> None:
+    method = working(CnnPatch, 9)
+    optimizer = torch.optim.SGD(method.parameters(), 0.1)
+    with pytest.raises(UserError, match="gradient_clip_algorithm=value"):
+        method.configure_gradient_clipping(optimizer, 1.0, "value")

@@ -12,6 +12,7 @@ from posefilter.data.frames import Sample
 from posefilter.errors import UserError
 from posefilter.geometry.camera import resize_intrinsics
 
+_MOST_PIXELS = 1 << 22  # that an image is enlarged to
 SMOOTH = 0.02  # neighboring depths within this share of each other lie on one surface
 
 
@@ -30,6 +31,11 @@ def network_size(
     if min(image_width, image_height) < 8:
         raise UserError(
             f"image size {image_width}x{image_height}: at least 8 pixels a side (data.image_width)"
+        )
+    if image_width * image_height > max(_MOST_PIXELS, height * width):
+        raise UserError(
+            f"image: {width}x{height} is so narrow that it would become {image_width}x"
+            f"{image_height} (data.image_width); crop it, or is it turned?"
         )
     if abs(image_width / width - image_height / height) > 0.02 * image_width / width:
         raise UserError(

@@ -11,7 +11,7 @@ import itertools
 import time
 from collections.abc import Callable, Iterable
 from functools import cache, cached_property
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar, Self
 
 import torch
 from torch import Generator, Tensor, nn
@@ -40,6 +40,7 @@ from posefilter.models.clipping import SubmoduleClipper
 from posefilter.models.lr_schedulers import find_length, start_schedule
 from posefilter.models.quantization import unpack_object
 from posefilter.models.zoom import check_zoom, choose_part, search
+from posefilter.nets import folded, fused
 from posefilter.protocols import Loss, ScoresPoses, Space
 from posefilter.types import Batch, BeliefBatch, ObjectModel, ParticleOutput, Particles, Step, Trace
 
@@ -379,7 +380,16 @@ class PoseEstimator(Module):
         gradient_clip_val: float | None = None,
         gradient_clip_algorithm: str | None = None,
     ) -> None:
-        """Clip the gradient of each submodule by its own norm (`SubmoduleClipper`)."""
+        """Clip the gradient of each submodule by its own norm (`SubmoduleClipper`).
+
+        Raises:
+            UserError: It is to be clipped in another way.
+        """
+        if gradient_clip_algorithm not in (None, "norm"):
+            raise UserError(
+                f"gradient_clip_algorithm={gradient_clip_algorithm}: gradients are clipped by the "
+                "norm of each network; leave it out"
+            )
         self.clipper.clip(self, gradient_clip_val, getattr(self, "global_step", 0))
 
     # -- validation and test -----------------------------------------------------------------------
@@ -422,7 +432,13 @@ class PoseEstimator(Module):
         """Return the metrics since the last reset, in the form of metrics.json."""
         return evaluation.compute_metrics(self)
 
+    def train(self, mode: bool = True) -> Self:
+        """Switch to training or evaluation."""
+        _forget_cached_weights()
+        return super().train(mode)
+
     def _reset(self) -> None:
+        _forget_cached_weights()  # a callback may have changed weights through `.data`
         self.seconds_per_image = []
         for metric in self.scores.values():
             metric.reset()
@@ -463,6 +479,11 @@ class PoseEstimator(Module):
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Set the object that the checkpoint holds."""
         self.set_object(unpack_object(checkpoint["object_model"]))
+
+
+def _forget_cached_weights() -> None:
+    for cache_of_weights in (folded.CACHE, fused.CACHE):
+        cache_of_weights.clear()
 
 
 def _has_all_images() -> bool:

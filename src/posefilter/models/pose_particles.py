@@ -121,5 +121,9 @@ class Hypotheses(PoseParticles):
 
 def require_depth(valid: Tensor) -> None:
     """Raise UserError where an image has no known depth.  (B, ...) bool."""
-    if not bool(valid.flatten(1).any(1).all()):
-        raise UserError("depth: so few pixels of an image have depth that no pose can be proposed")
+    without = (~valid.flatten(1).any(1)).nonzero().flatten().tolist()
+    if without:
+        which = f" (image {without[0]} of {len(valid)}, from 0)" if len(valid) > 1 else ""
+        raise UserError(
+            f"depth: so few pixels of an image have depth that no pose can be proposed{which}"
+        )

@@ -237,7 +237,11 @@ class PosePF(PoseParticles):
         return out
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Save the candidate sampler's state, so that a resumed run ends as one not interrupted."""
+        """Save the candidate sampler's state, so that a resumed run ends as one not interrupted.
+
+        With several processes it is that of the first: the particles of the others' frames are lost,
+        and start anew.
+        """
         super().on_save_checkpoint(checkpoint)
         checkpoint["candidate_sampler"] = self.candidate_sampler.state()
 

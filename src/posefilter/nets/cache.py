@@ -17,6 +17,9 @@ class _Entry(NamedTuple, Generic[T]):
 class ModuleCache(Generic[T]):
     """Values computed from modules' tensors; each is computed once until a tensor changes.
 
+    A change through `.data` does not tell: `clear` after it, as `PoseEstimator` does where training
+    or evaluation begins.
+
     They lie beside the modules, so that neither a copy nor a file of a module holds them.
 
     Args:
