@@ -12,9 +12,10 @@ Ways: `search` weights as the filter does by default (`filter/reweight=current_l
 reads the likelihood at every step; `islands` and `niches` do too, and resample within islands
 (`filter/resample=islands`) or niches (`filter/resample=niches`); `tempered` counts it once
 (`likelihood_ratio`); `drawn anew` is a last pass of importance sampling
-(`filter/refine=mean_shift_and_importance`); `moved` does so in more rounds, and adds moves that leave the
-posterior unchanged (`filter/refine=mean_shift_and_resample_move`).  `exact draws`
-are what a perfect sampler would give: their gap is the kernel density's own.
+(`filter/refine=mean_shift_and_importance`); `moved` has more rounds of it, those before the last
+tempered, and then moves that leave the posterior unchanged
+(`filter/refine=mean_shift_and_resample_move`).  `exact draws` are what a perfect sampler would
+give: their gap is the kernel density's own.
 
 Truths are drawn from the posterior.  `gap` is the mean log density that the exact posterior has at
 them less that of the belief, over runs and truths; `mass` is the mean error of the first mode's

@@ -8,7 +8,8 @@ import torch
 from torch import Generator, Tensor
 
 from posefilter.errors import UserError
-from posefilter.filters.importance import ImportanceSampling
+from posefilter.filters.importance import ImportanceSampling, temper
+from posefilter.filters.resample import effective_sample_size
 from posefilter.geometry.pose import make_pose, move_about
 from posefilter.geometry.pose_density import (
     draw_poses,
@@ -154,3 +155,43 @@ def test_kernels_are_of_their_own_mode_though_it_has_few_poses() -> None:
     before = BeliefBatch(poses, torch.full((3, 40), -math.log(40)), poses[:, 0], torch.zeros(3))
     after = ImportanceSampling(400, 1, widening=1.0)(before, None, Two(), g)  # type: ignore[arg-type]
     assert float((-after.log_weights.mul(2).logsumexp(1)).exp().mean()) > 35
+
+
+def test_tempered_rounds_weigh_a_narrow_mode_as_its_mass() -> None:
+    """Two modes of equal mass, one half as wide, the search's particles wider than both: without
+    tempering the narrow one's few good particles decide its fate.
+    """
+    turn = torch.diag(torch.tensor([1.0, -1.0, -1.0])).double()
+    half = make_pose(turn, CENTER - turn @ CENTER)
+
+    class Unlike(Known):
+        def score_poses(self, encoding: Any, poses: Tensor, *rest: Any) -> Tensor:
+            wide = super().score_poses(encoding, poses, *rest).double()
+            narrow = super().score_poses(encoding, poses.double() @ half, *rest).double() / 0.5**2
+            return torch.logaddexp(wide, narrow - 6 * math.log(0.5)).float()
+
+    worst = {}
+    for least in (0.0, 0.2):
+        masses = []
+        for seed in range(8):
+            g = Generator().manual_seed(seed)
+            noise = torch.randn(1, 200, 6, generator=g).double() * SCALE * 1.5
+            poses = move_about(torch.eye(4).double().expand(1, 200, 4, 4), noise, CENTER)
+            poses[:, 100:] = poses[:, 100:] @ half
+            even = torch.full((1, 200), -math.log(200))
+            before = BeliefBatch(poses, even, poses[:, 0], torch.zeros(1))
+            sampling = ImportanceSampling(400, 5, widening=1.0, min_effective=least)
+            after = sampling(before, None, Unlike(), g)  # type: ignore[arg-type]
+            masses.append(float(((after.poses[:, :, 2, 2] < 0) * after.log_weights.exp()).sum()))
+        worst[least] = max(abs(mass - 0.5) for mass in masses)
+    assert worst[0.2] < 0.15
+    assert worst[0.0] > 0.3
+
+
+def test_weights_are_tempered_as_little_as_is_needed() -> None:
+    uneven = torch.tensor([[0.0, -5.0, -50.0, -math.inf], [0.0, 0.0, 0.0, 0.0]]).log_softmax(1)
+    tempered = temper(uneven, 0.5)
+    assert float(effective_sample_size(tempered)[0]) == pytest.approx(2, rel=1e-4)
+    torch.testing.assert_close(tempered[1], uneven[1])
+    torch.testing.assert_close(temper(uneven, 0.0)[:, :3], uneven[:, :3])
+    assert temper(torch.tensor([[0.0, -math.inf, -math.inf]]), 1.0).isfinite().all()

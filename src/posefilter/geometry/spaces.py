@@ -136,8 +136,8 @@ class PartsSpace(PoseSpace):
     parts: int = 1
 
     def split(self, count: int) -> list[slice]:
-        """Return which of `count` particles are of each part; the first blocks are longer by one
-        where the number is no multiple of the parts'.
+        """Return which of `count` particles are of each part; some blocks are longer by one where
+        the number is no multiple of the parts'.
         """
         ends = [(k * count + self.parts - 1) // self.parts for k in range(self.parts + 1)]
         return [slice(*pair) for pair in pairwise(ends)]

@@ -15,6 +15,7 @@ from posefilter.meshes.ply import COLORS, open_ply
 
 SUFFIXES = (".obj", ".ply", ".glb")
 _FARTHEST = 1e6  # [m]
+_ROUNDED = 1e-4  # of its size: what rounding may move of an object
 
 
 def read_mesh(path: Path, name: str, scale: float = 1.0) -> Mesh:
@@ -65,6 +66,17 @@ def _finish(raw: RawMesh, path: Path, name: str, scale: float) -> Mesh:
     vertices = raw.vertices[used].astype(np.float64) * scale
     if np.abs(vertices).max() > _FARTHEST:
         raise UserError(f"{path}: vertices farther than {_FARTHEST:,.0f} m; mind the unit")
+    size = float(np.ptp(vertices, axis=0).max())
+    reach = float(np.abs(vertices).max())
+    if reach * np.finfo(np.float32).eps > _ROUNDED * size > 0:
+        raise UserError(
+            f"{path}: an object of {size:.3g} m whose origin is {reach:,.0f} m away, which 32 bits "
+            "do not resolve; move it to its origin"
+        )
+    corners = vertices[faces]
+    across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    if not np.abs(across).max() > 0:
+        raise UserError(f"{path}: the triangles have no area (do all vertices lie on one line?)")
     turned = looks_inward(vertices, faces)
     if turned:
         faces, raw = faces[:, ::-1], _reverse_corners(raw)

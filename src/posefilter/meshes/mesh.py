@@ -207,6 +207,10 @@ def find_hull(vertices: np.ndarray) -> ConvexHull:
     try:
         return ConvexHull(vertices, qhull_options="QJ")
     except QhullError as error:
+        if len(vertices) < 4:
+            raise UserError(
+                f"mesh: has {len(vertices)} vertices; an object has 4 or more"
+            ) from error
         size = float(np.ptp(vertices, axis=0).max())
         raise UserError(
             f"mesh: has no convex hull; {size:.3g} m across, it is a point or too small: mind the "

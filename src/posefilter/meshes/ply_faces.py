@@ -48,25 +48,28 @@ _Row = Mapping[str, tuple[float, ...]]  # by property
 
 
 def split_faces(header: str, body: bytes) -> tuple[str, bytes]:
-    """Split the faces of a binary file into triangles, where they are of several sizes.
+    """Split the faces of a file into triangles: of a binary one where they are of several sizes, of
+    a text where some are no triangles.
 
     Args:
         header: Of a PLY file, up to its last line.
         body: The rest.
 
     Returns:
-        Both, changed; as they are where all faces are of one size, or the file is a text.
+        Both, changed; as they are where all faces are triangles.
 
     Raises:
         ValueError, struct.error: The file is cut short or broken.
     """
     form = re.search(r"^format\s+(\w+)", header, re.MULTILINE)
-    if form is None or form[1] not in _ORDERS:
+    if form is None or form[1] not in (*_ORDERS, "ascii"):
         return header, body
     elements = list(list_elements(header))
     if [element.name for element in elements[:2]] != _FIRST:
         return header, body
     vertex, face = elements[:2]
+    if form[1] == "ascii":
+        return _split_text(header, body, vertex, face)
     corners = next((p.name for p in face.properties if p.name in _CORNERS and p.length), None)
     if corners is None or any(p.length for p in vertex.properties):
         return header, body
@@ -95,6 +98,37 @@ def split_faces(header: str, body: bytes) -> tuple[str, bytes]:
     packed = b"".join(_pack(one, face, order) for one in out)
     header = re.sub(r"^(\s*element\s+face\s+)\d+", rf"\g<1>{len(out)}", header, flags=re.MULTILINE)
     return header, body[:start] + packed + body[stop:]
+
+
+def _split_text(header: str, body: bytes, vertex: Element, face: Element) -> tuple[str, bytes]:
+    """Split the faces of a text file, as `split_faces` does.
+
+    Faces whose corners are not the first of their numbers, or that have other lists, too, such as
+    texture coordinates, are left to trimesh.
+    """
+    lists = [p.name in _CORNERS for p in face.properties if p.length]
+    names = [p.name for p in vertex.properties]
+    plain = face.properties and face.properties[0].name in _CORNERS and lists == [True]
+    if not plain or any(p.length for p in vertex.properties) or not {*"xyz"} <= {*names}:
+        return header, body
+    lines = [line for line in body.splitlines()[1:] if line.strip()]
+    rows = [line.split() for line in lines[vertex.rows : vertex.rows + face.rows]]
+    if all(row[0] == b"3" for row in rows):
+        return header, body
+    columns = [names.index(axis) for axis in "xyz"]
+    table = [line.split() for line in lines[: vertex.rows]]
+    vertices = np.array([[float(row[column]) for column in columns] for row in table])
+    out = []
+    for row in rows:
+        size = int(row[0])
+        places, rest = row[1 : size + 1], row[size + 1 :]
+        if size > 2:
+            (split,) = triangulate(vertices[np.array(places, int)][None])
+            out += [b" ".join([b"3", *(places[i] for i in one), *rest]) for one in split]
+    header = re.sub(r"^(\s*element\s+face\s+)\d+", rf"\g<1>{len(out)}", header, flags=re.MULTILINE)
+    first = body[: body.index(b"\n") + 1]
+    after = lines[vertex.rows + face.rows :]
+    return header, first + b"\n".join([*lines[: vertex.rows], *out, *after]) + b"\n"
 
 
 def list_elements(header: str) -> Iterator[Element]:

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from posefilter.meshes.symmetries import are_parallel, rotation_about, symmetry_group
+from posefilter.meshes.symmetries import SAME_TURN, are_parallel, rotation_about, symmetry_group
 
 ANY = 0  # the fold of a turn by any angle
 _MOST_ELEMENTS = 60  # of a finite group of turns that is not of one axis
@@ -19,7 +19,7 @@ class RotationalSymmetry(NamedTuple):
 
     axis: np.ndarray  # (3,) unit vector
     point: np.ndarray  # (3,) on the axis [m]
-    fold: int  # 2, 3 or 4 for turns by that part of a circle, 0 for any
+    fold: int  # 2, 3, 4 or 5 for turns by that part of a circle, 0 for any
     # mean distance of the turned surface to the surface, less that of two samplings [m]
     distance: float
     far: float  # the same of the distance that a fiftieth of the samples exceed [m]
@@ -79,12 +79,16 @@ def list_discrete(turns: Sequence[RotationalSymmetry], size: float) -> list[np.n
     group, is left out: its axis is measured too badly.
     """
     kept: list[np.ndarray] = []
-    group = _close(kept, size)
+    # where the origin goes tells nothing if it is far from the object
+    middle = (
+        np.append(np.mean([turn.point for turn in turns], axis=0), 1) if turns else np.eye(4)[3]
+    )
+    group = _close(kept, size, middle)
     for turn in turns:
         if turn.fold == ANY:
             continue
         more = [*kept, rotation_about(turn.axis, 2 * np.pi / turn.fold, turn.point)]
-        products = _close(more, size)
+        products = _close(more, size, middle)
         if len(products) <= _MOST_ELEMENTS and min(map(_measure, products[1:])) > _SMALLEST:
             kept, group = more, products
     return group[1:]
@@ -106,7 +110,7 @@ def describe_symmetries(turns: Sequence[RotationalSymmetry], size: float) -> dic
     }
 
 
-def _close(generators: Sequence[np.ndarray], size: float) -> list[np.ndarray]:
+def _close(generators: Sequence[np.ndarray], size: float, middle: np.ndarray) -> list[np.ndarray]:
     """Return the products of transforms, the identity first; more than `_MOST_ELEMENTS` of them
     where they do not close.
     """
@@ -114,7 +118,7 @@ def _close(generators: Sequence[np.ndarray], size: float) -> list[np.ndarray]:
     for element in group:  # grows meanwhile
         for generator in generators:
             product = element @ generator
-            if all(_differ(product, one, size) for one in group):
+            if all(_differ(product, one, size, middle) for one in group):
                 group.append(product)
         if len(group) > _MOST_ELEMENTS:
             break
@@ -126,7 +130,9 @@ def _measure(transform: np.ndarray) -> float:
     return float(np.arccos(np.clip((np.trace(transform[:3, :3]) - 1) / 2, -1, 1)))
 
 
-def _differ(a: np.ndarray, b: np.ndarray, size: float) -> bool:
-    """Tell whether two transforms differ by more than the errors of measured axes."""
-    turned = np.abs(a[:3, :3] - b[:3, :3]).max() > 0.2
-    return bool(turned or np.abs(a[:3, 3] - b[:3, 3]).max() > 0.1 * size)
+def _differ(a: np.ndarray, b: np.ndarray, size: float, middle: np.ndarray) -> bool:
+    """Tell whether two transforms differ by more than the errors of measured axes, in what they do
+    to the object about its middle (4,), homogeneous.
+    """
+    turned = np.abs(a[:3, :3] - b[:3, :3]).max() > SAME_TURN
+    return bool(turned or np.abs((a - b) @ middle).max() > 0.1 * size)

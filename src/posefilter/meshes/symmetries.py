@@ -1,5 +1,6 @@
 """Symmetries of objects: declared transforms that change nothing one can see."""
 
+from collections.abc import Sequence
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
@@ -15,6 +16,8 @@ from posefilter.limits import read_json
 
 MOST = 10_000  # symmetries of an object
 _MOST_BYTES = 1 << 24  # of a file of them
+_MOST_PRODUCTS = 120  # the rotations of an icosahedron are 60
+SAME_TURN = 0.2  # of rotation matrices' entries: less is the error of a measured axis
 _PARALLEL = np.cos(np.deg2rad(10.0))
 
 
@@ -29,13 +32,14 @@ def symmetry_group(
     Turns about two axes that cross make all rotations: then it is `steps` squared of these, evenly
     spread, about the point where the axes meet.
 
-    `discrete`: (4, 4) each, as BOP lists them (all but the identity). `continuous`: (axis, a point
-    on it [m]) each, cut into `steps` equal turns.
+    `discrete`: (4, 4) each, as BOP lists them (all but the identity), or some of which the others
+    are products. `continuous`: (axis, a point on it [m]) each, cut into `steps` equal turns.
 
     Raises:
-        ValueError: They are more than `MOST`, or an axis has no direction.
+        ValueError: They are more than `MOST`, the products of discrete ones have no end, or an
+            axis has no direction.
     """
-    group, lines = [np.eye(4), *(discrete or [])], []
+    group, lines = close_group(discrete or []), []
     for axis, offset in continuous or []:
         length = float(np.linalg.norm(axis))
         if not (np.isfinite(length) and length > 0):
@@ -52,6 +56,31 @@ def symmetry_group(
         about = [rotation_about(axis, 2 * np.pi * k / steps, offset) for k in range(steps)]
         group = [a @ b for a in group for b in about]
     return np.stack(group)
+
+
+def close_group(discrete: Sequence[np.ndarray]) -> list[np.ndarray]:
+    """Return the identity, symmetries (4, 4) as they are, and all products of them that turn the
+    object otherwise: a quarter turn has a half turn and three quarters with it.
+
+    Of an object, no two symmetries have one rotation: where turns are within the errors of measured
+    axes of each other they count as one.
+
+    Raises:
+        ValueError: The products have no end.
+    """
+    group = [np.eye(4), *discrete]
+    if len(group) > _MOST_PRODUCTS:  # a continuous one in steps, listed whole
+        return group
+    turns = np.stack(group)[:, :3, :3]
+    for element in group:  # grows meanwhile
+        for generator in discrete:
+            product = element @ generator
+            if np.abs(turns - product[:3, :3]).max(axis=(1, 2)).min() > SAME_TURN:
+                group.append(product)
+                turns = np.concatenate([turns, product[None, :3, :3]])
+        if len(group) > _MOST_PRODUCTS:
+            raise ValueError("the products of its discrete symmetries have no end")
+    return group
 
 
 def are_parallel(a: np.ndarray, b: np.ndarray) -> bool:

@@ -81,7 +81,7 @@ class PartIoU(Metric):
         at = (batch.mask[b, 0] & (batch.depth[b, 0] > 0)).nonzero()
         if len(at) == 0:
             return
-        at = at[:: max(1, len(at) // _PIXELS)]
+        at = at[:: max(1, -(-len(at) // _PIXELS))]
         z = batch.depth[b, 0][at[:, 0], at[:, 1]]
         points = back_project(at.flip(1)[None].to(z), z[None], batch.intrinsics[b : b + 1])[0]
         labels = label_pixels(points, batch.camera_from_object[b], self.object_model)

@@ -239,8 +239,8 @@ class PosePF(PoseParticles):
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Save the candidate sampler's state, so that a resumed run ends as one not interrupted.
 
-        With several processes it is that of the first: the particles of the others' frames are lost,
-        and start anew.
+        With several processes it is that of the first: the particles of the others' frames start
+        anew.
         """
         super().on_save_checkpoint(checkpoint)
         checkpoint["candidate_sampler"] = self.candidate_sampler.state()
