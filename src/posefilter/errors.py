@@ -62,7 +62,7 @@ def check_seed(seed: object) -> int:
 
     Raises UserError unless it is a whole number, 0 or more, of 64 bits.
     """
-    if isinstance(seed, bool) or not isinstance(seed, Integral) or not 0 <= seed < 1 << 64:
+    if isinstance(seed, bool) or not isinstance(seed, Integral) or not 0 <= int(seed) < 1 << 64:
         raise UserError(f"seed={seed!r}: must be a whole number, 0 or more and below 2^64")
     return int(seed)
 

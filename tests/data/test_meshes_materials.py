@@ -236,8 +236,15 @@ def test_broken_text_ply_is_refused(tmp_path: Path) -> None:
         read_mesh(_write_text(path, PLY.format(wide, 2, "") + rows), "a")
     own = "property uchar red\nproperty uchar green\nproperty uchar blue\n"
     quad = "0 0 0\n1 0 0\n1 1 0\n0 1 0\n4 0 1 2 3 255 0 0\n"
+    mesh = read_mesh(_write_text(path, PLY.format("", 1, own) + quad), "a")
+    np.testing.assert_allclose(
+        surface_colors(mesh, np.array([0, 1]), MIDDLE[[0, 0]]), [[1, 0, 0]] * 2
+    )
+    first = PLY.format("", 1, "").replace("property list", f"{own}property list")
     with pytest.raises(UserError, match="1 colors for 2 triangles"):
-        read_mesh(_write_text(path, PLY.format("", 1, own) + quad), "a")
+        read_mesh(
+            _write_text(path, first + quad.replace("4 0 1 2 3 255 0 0", "255 0 0 4 0 1 2 3")), "a"
+        )
 
 
 def test_binary_triangles_are_left_as_they_are(monkeypatch: pytest.MonkeyPatch) -> None:
