@@ -8,7 +8,7 @@ from torch import Generator, Tensor
 
 from posefilter.errors import UserError
 from posefilter.filters.loop import make_particles
-from posefilter.filters.niches import Niches, find_peaks
+from posefilter.filters.niches import Niches, draw_within, find_peaks
 from posefilter.geometry.spaces import PixelSpace
 
 PIXELS = PixelSpace()
@@ -38,17 +38,25 @@ def test_a_particle_without_weight_is_no_peak_and_has_no_children() -> None:
     assert set(draw(state, log_w, 12)[0].tolist()) == {0, 1, 3}
 
 
-def test_the_number_of_peaks_divides_the_children() -> None:
-    state = torch.randn(40, 2, generator=Generator().manual_seed(1))
-    log_w = torch.zeros(40).log_softmax(0)
-    for count, peaks in ((40, 20), (30, 15), (26, 13), (23, 1)):
-        assert len(find_peaks(state, log_w, PIXELS, 20, count)) == peaks
+@pytest.mark.parametrize("count", [40, 26, 23, 7])
+def test_niches_have_as_many_children_up_to_one(count: int) -> None:
+    state = torch.randn(1, 40, 2, generator=Generator().manual_seed(1))
+    niche = torch.arange(40) % 5
+    log_w = torch.randn(40, generator=Generator().manual_seed(2)).log_softmax(0)
+    ancestors, log_weights = draw_within(log_w, niche, 5, count, Generator().manual_seed(3))
+    each = niche[ancestors].bincount(minlength=5)
+    assert int(each.sum()) == count
+    assert int(each.max() - each.min()) <= 1
+    for k in range(5):
+        mass = log_weights[niche[ancestors] == k].exp().sum()
+        torch.testing.assert_close(mass, log_w[niche == k].double().exp().sum())
+    assert len(find_peaks(state[0], log_w, PIXELS, 20)) == 20
 
 
 def test_the_heaviest_particle_is_the_first_peak() -> None:
     state = torch.randn(50, 2, generator=Generator().manual_seed(2))
     log_w = torch.randn(50, generator=Generator().manual_seed(3))
-    assert int(find_peaks(state, log_w, PIXELS, 5, 50)[0]) == int(log_w.argmax())
+    assert int(find_peaks(state, log_w, PIXELS, 5)[0]) == int(log_w.argmax())
 
 
 def test_weights_that_are_no_numbers_are_left_to_the_filter_to_refuse() -> None:

@@ -68,7 +68,7 @@ def test_a_narrow_image_is_not_enlarged_without_limit(
     rgb, depth = np.full((*size, 3), 90, np.uint8), np.full(size, 0.8, np.float32)
     rgb[::2] = 200
     narrow = np.array([[50.0, 0, size[1] / 2], [0, 50.0, size[0] / 2], [0, 0, 1]])
-    with pytest.raises(UserError, match="so narrow that it would become 320x"):
+    with pytest.raises(UserError, match="would be enlarged to 320x"):
         small.predict(rgb, depth, narrow)
 
 

@@ -34,8 +34,8 @@ def network_size(
         )
     if image_width * image_height > max(_MOST_PIXELS, height * width):
         raise UserError(
-            f"image: {width}x{height} is so narrow that it would become {image_width}x"
-            f"{image_height} (data.image_width); crop it, or is it turned?"
+            f"image: {width}x{height} would be enlarged to {image_width}x{image_height} pixels "
+            f"(data.image_width), which are too many; crop it if it is long and narrow"
         )
     if abs(image_width / width - image_height / height) > 0.02 * image_width / width:
         raise UserError(

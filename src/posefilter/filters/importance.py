@@ -133,7 +133,7 @@ def temper(log_weights: Tensor, least: float) -> Tensor:
     Returns:
         (B, N), normalized.
     """
-    # of no weight at all every power is none, but the power 0
+    # so that no weight to the power 0 is a number
     log_weights = log_weights.clamp_min(0.5 * torch.finfo(log_weights.dtype).min)
     low, high = torch.zeros_like(log_weights[:, :1]), torch.ones_like(log_weights[:, :1])
     power = high

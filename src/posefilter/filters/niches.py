@@ -18,7 +18,7 @@ import torch
 from torch import Generator, Tensor
 
 from posefilter.errors import UserError
-from posefilter.filters.resample import Systematic, inverse_cdf
+from posefilter.filters.resample import inverse_cdf
 from posefilter.protocols import Space
 from posefilter.types import Particles, Resampled
 
@@ -27,7 +27,7 @@ _PAIRS = 1 << 20  # distances that are held at once
 
 
 class Niches:
-    """Resample within niches, which have equally many children.
+    """Resample within niches, which have equally many children, up to one.
 
     A particle is the farther from all heavier ones, the more it is a peak of its own: the particles
     of which this distance is largest are the peaks (Rodriguez and Laio 2014), and a niche is all
@@ -36,7 +36,7 @@ class Niches:
     in expectation. With fewer modes than niches a mode has several.
 
     Args:
-        niches: Their number at most; it divides that of the children.
+        niches: Their number at most.
 
     Raises:
         UserError: The number is below 1.
@@ -53,7 +53,7 @@ class Niches:
         """Return children; those of a niche follow one another."""
         log_w, children = particles.log_weights, []
         for state, own in zip(particles.state, log_w.detach(), strict=True):
-            peaks = find_peaks(state, own, space, self.niches, count)
+            peaks = find_peaks(state, own, space, min(self.niches, count))
             niche = space.distance(state[:, None], state[peaks]).argmin(1)
             niche[peaks] = torch.arange(len(peaks), device=niche.device)  # equal ones apart
             children.append(draw_within(own, niche, len(peaks), count, generator))
@@ -61,7 +61,7 @@ class Niches:
         return Resampled(ancestors, log_weights.to(log_w))
 
 
-def find_peaks(state: Tensor, log_weights: Tensor, space: Space, most: int, count: int) -> Tensor:
+def find_peaks(state: Tensor, log_weights: Tensor, space: Space, most: int) -> Tensor:
     """Return the particles that are farthest from all heavier ones.
 
     Args:
@@ -69,7 +69,6 @@ def find_peaks(state: Tensor, log_weights: Tensor, space: Space, most: int, coun
         log_weights: (N,).
         space: Of the particles.
         most: Number of peaks, at most.
-        count: Of which the number of peaks is a divisor.
 
     Returns:
         (K,) int64, the heaviest particle among them.
@@ -85,22 +84,24 @@ def find_peaks(state: Tensor, log_weights: Tensor, space: Space, most: int, coun
         distance = space.distance(sorted_state[block][:, None], sorted_state[heavier])
         apart.append(distance.masked_fill(heavier >= block[:, None], torch.inf).amin(1))
     farthest = torch.cat(apart)
-    distinct = min(most, int((farthest > 0).sum()))
-    peaks = max(n for n in range(1, distinct + 1) if count % n == 0)
-    return order[farthest.argsort(descending=True, stable=True)[:peaks]]
+    return order[farthest.argsort(descending=True, stable=True)[:most]]
 
 
 def draw_within(
     log_weights: Tensor, niche: Tensor, niches: int, count: int, generator: Generator
 ) -> tuple[Tensor, Tensor]:
-    """Draw `count / niches` ancestors in each niche.
+    """Draw ancestors in each niche, systematically; the first niches have one child more where the
+    niches' number is no divisor of `count`.
 
     (M,) normalized, (M,) int64 the niche of each particle -> (count,) int64, (count,) log weights.
     """
     each = torch.arange(niches, device=niche.device)[:, None]
     own = log_weights.double().masked_fill(niche != each, -torch.inf)
     mass = own.logsumexp(1, keepdim=True)
-    children = count // niches
-    uniforms = Systematic().uniforms(niches, children, generator, niche.device)
-    ancestors = inverse_cdf(own - mass, uniforms)
-    return ancestors.flatten(), (mass - math.log(children)).expand(-1, children).flatten()
+    children = count // niches + (each < count % niches)
+    rank = torch.arange(int(children[0]), device=niche.device)
+    offset = torch.rand(niches, 1, generator=generator, device=niche.device)
+    ancestors = inverse_cdf(own - mass, (rank + offset) / children)
+    weights = (mass - children.log()).expand_as(ancestors)
+    is_child = rank < children
+    return ancestors[is_child], weights[is_child]
