@@ -60,10 +60,10 @@ def check_range(key: str, value: Sequence[float], least: float = -math.inf) -> t
 def check_seed(seed: object) -> int:
     """Return a seed as Python's own number: numpy's overflow.
 
-    Raises UserError unless it is a whole number, 0 or more, of 64 bits.
+    Raises UserError unless it is a whole number, 0 or more.
     """
-    if isinstance(seed, bool) or not isinstance(seed, Integral) or not 0 <= int(seed) < 1 << 64:
-        raise UserError(f"seed={seed!r}: must be a whole number, 0 or more and below 2^64")
+    if isinstance(seed, bool) or not isinstance(seed, Integral) or seed < 0:
+        raise UserError(f"seed={seed!r}: must be a whole number, 0 or more")
     return int(seed)
 
 

@@ -16,6 +16,7 @@ _CREASE = np.cos(np.deg2rad(40.0))  # faces that meet at more than this share no
 OPEN_EDGES = 0.01  # share of a surface's edges; one with more is not closed
 _MOST_PAIRS = 4e8  # of faces that meet
 _CHUNK = 1 << 24  # of such pairs at once
+_POINT = 1e-6  # [m] a smaller object is in another unit
 _HULL_VERTICES = 128
 _HULL_DIRECTIONS = 5000  # some 2.9 degrees apart
 _HULL_ERROR = 2.5e-4  # [m] stop refining the outline hull here
@@ -207,11 +208,10 @@ def find_hull(vertices: np.ndarray) -> ConvexHull:
     try:
         return ConvexHull(vertices, qhull_options="QJ")
     except QhullError as error:
-        if len(vertices) < 4:
-            raise UserError(
-                f"mesh: has {len(vertices)} vertices; an object has 4 or more"
-            ) from error
         size = float(np.ptp(vertices, axis=0).max())
+        if len(vertices) < 4 and size > _POINT:
+            text = f"mesh: has {len(vertices)} vertices; an object has 4 or more"
+            raise UserError(text) from error
         raise UserError(
             f"mesh: has no convex hull; {size:.3g} m across, it is a point or too small: mind the "
             f"unit (mesh_scale)"

@@ -218,7 +218,7 @@ class PosePF(PoseParticles):
         finite = best.isfinite().flatten(1).all(1)  # any other is a miss
         best = torch.where(finite[:, None, None], best, truth)
         pair = torch.stack([best, truth], dim=1)
-        generator = torch.Generator(device=self.device).manual_seed(self.seed)
+        generator = torch.Generator(device=self.device).manual_seed(self.seed % (1 << 63))
         sigma = pair.new_tensor(self.comparison_sigma)
         scores = self._score(encoding, pair, sigma, generator, self.comparison_pixels)
         outscored = finite & (scores[:, 0] > scores[:, 1])
