@@ -79,7 +79,7 @@ def list_discrete(turns: Sequence[RotationalSymmetry], size: float) -> list[np.n
     group, is left out: its axis is measured too badly.
     """
     kept: list[np.ndarray] = []
-    # where the origin goes tells nothing if it is far from the object
+    # a far origin moves by more than the object does
     middle = (
         np.append(np.mean([turn.point for turn in turns], axis=0), 1) if turns else np.eye(4)[3]
     )

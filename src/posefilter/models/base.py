@@ -49,7 +49,7 @@ if TYPE_CHECKING:
 else:
     Module = nn.Module  # `with_lightning` adds Lightning's
 
-_SEEDS = 1 << 63  # a generator takes smaller ones
+SEEDS = 1 << 63  # a generator takes smaller ones
 _STAGES = {"train": 0, "validate": 1, "test": 2, "predict": 3}
 
 
@@ -162,7 +162,7 @@ class PoseEstimator(Module):
             batch_number = batch_number * self._trainer.world_size + self._trainer.global_rank
         epoch = getattr(self, "current_epoch", 0) if stage == "train" else 0
         seed = ((self.seed * 8 + _STAGES[stage]) * 100_003 + epoch) * 1_000_003 + batch_number
-        return torch.Generator(device=self.device).manual_seed(seed % _SEEDS)
+        return torch.Generator(device=self.device).manual_seed(seed % SEEDS)
 
     # -- what a method defines ---------------------------------------------------------------------
 
@@ -248,7 +248,7 @@ class PoseEstimator(Module):
         if not isinstance(self, ScoresPoses):
             return None
         # the same image points each time: an estimate is as probable as before
-        generator = torch.Generator(device=self.device).manual_seed(self.seed % _SEEDS)
+        generator = torch.Generator(device=self.device).manual_seed(self.seed % SEEDS)
 
         def score(poses: Tensor) -> Tensor:
             encoding = self.encode(batch) if trace.encoding is None else trace.encoding

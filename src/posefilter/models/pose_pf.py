@@ -11,6 +11,7 @@ from posefilter.data.absent import hide_annotation
 from posefilter.filters.traces import map_tensors
 from posefilter.geometry.spaces import to_device
 from posefilter.metrics.scores import InstanceErrors
+from posefilter.models.base import SEEDS
 from posefilter.models.candidate_samplers import CandidateSampler
 from posefilter.models.pose_particles import PoseParticles, require_depth
 from posefilter.nets.coordinates import Cells, Coordinates, coordinate_loss
@@ -218,7 +219,7 @@ class PosePF(PoseParticles):
         finite = best.isfinite().flatten(1).all(1)  # any other is a miss
         best = torch.where(finite[:, None, None], best, truth)
         pair = torch.stack([best, truth], dim=1)
-        generator = torch.Generator(device=self.device).manual_seed(self.seed % (1 << 63))
+        generator = torch.Generator(device=self.device).manual_seed(self.seed % SEEDS)
         sigma = pair.new_tensor(self.comparison_sigma)
         scores = self._score(encoding, pair, sigma, generator, self.comparison_pixels)
         outscored = finite & (scores[:, 0] > scores[:, 1])
