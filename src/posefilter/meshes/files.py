@@ -9,7 +9,7 @@ import trimesh
 from posefilter.errors import UserError
 from posefilter.meshes.atlas import merge_materials
 from posefilter.meshes.glb import check_glb
-from posefilter.meshes.mesh import Mesh, creased_normals, looks_inward
+from posefilter.meshes.mesh import Mesh, creased_normals, face_areas, looks_inward
 from posefilter.meshes.obj import BRIGHTEST, PLAIN, Material, RawMesh, read_image, read_obj
 from posefilter.meshes.ply import COLORS, open_ply
 
@@ -73,9 +73,7 @@ def _finish(raw: RawMesh, path: Path, name: str, scale: float) -> Mesh:
             f"{path}: an object of {size:.3g} m whose origin is {reach:,.0f} m away, which 32 bits "
             "do not resolve; move it to its origin"
         )
-    corners = vertices[faces]
-    across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    if not np.abs(across).max() > 0:
+    if not face_areas(vertices, faces).max() > 0:
         raise UserError(f"{path}: the triangles have no area (do all vertices lie on one line?)")
     turned = looks_inward(vertices, faces)
     if turned:

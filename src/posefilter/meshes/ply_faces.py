@@ -2,7 +2,7 @@
 
 import re
 import struct
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -80,24 +80,36 @@ def split_faces(header: str, body: bytes) -> tuple[str, bytes]:
     if _has_triangles(body, start, face, corners, order):
         return header, body
     rows, stop = _read_rows(body, start, face, order)
-    sizes = [len(one[corners]) for one in rows]
-    if set(sizes) <= {3}:
+    if all(len(one[corners]) == 3 for one in rows):
         return header, body
     table = np.frombuffer(body, row, vertex.rows, first)
     vertices = np.stack([table[axis] for axis in "xyz"], axis=1).astype(np.float64)
-    triangles = {}
-    for size in set(sizes) - {0, 1, 2}:
-        places = np.array([one[corners] for one in rows if len(one[corners]) == size], int)
-        triangles[size] = iter(triangulate(vertices[places]))
+    split = _split_each(vertices, [one[corners] for one in rows])
     out = [
-        _take(one, triangle, size)
-        for one, size in zip(rows, sizes, strict=True)
-        if size > 2
-        for triangle in next(triangles[size]).tolist()
+        _take(one, triangle, len(one[corners]))
+        for one, triangles in zip(rows, split, strict=True)
+        for triangle in triangles
     ]
     packed = b"".join(_pack(one, face, order) for one in out)
-    header = re.sub(r"^(\s*element\s+face\s+)\d+", rf"\g<1>{len(out)}", header, flags=re.MULTILINE)
-    return header, body[:start] + packed + body[stop:]
+    return _count_faces(header, len(out)), body[:start] + packed + body[stop:]
+
+
+def _split_each(vertices: np.ndarray, faces: Sequence[Sequence[Any]]) -> list[list[list[int]]]:
+    """Return the triangles of each face, as positions within it; all faces of a size at once.
+
+    (V, 3), the vertices' numbers of each face -> for each face its triangles, none of an edge.
+    """
+    sizes = [len(face) for face in faces]
+    triangles = {}
+    for size in set(sizes) - {0, 1, 2}:
+        places = np.array([face for face in faces if len(face) == size], int)
+        triangles[size] = iter(triangulate(vertices[places]).tolist())
+    return [next(triangles[size]) if size > 2 else [] for size in sizes]
+
+
+def _count_faces(header: str, count: int) -> str:
+    """Return a header that names another number of faces."""
+    return re.sub(r"^(\s*element\s+face\s+)\d+", rf"\g<1>{count}", header, flags=re.MULTILINE)
 
 
 def _split_text(header: str, body: bytes, vertex: Element, face: Element) -> tuple[str, bytes]:
@@ -112,23 +124,25 @@ def _split_text(header: str, body: bytes, vertex: Element, face: Element) -> tup
     if not plain or any(p.length for p in vertex.properties) or not {*"xyz"} <= {*names}:
         return header, body
     lines = [line for line in body.splitlines()[1:] if line.strip()]
-    rows = [line.split() for line in lines[vertex.rows : vertex.rows + face.rows]]
-    if all(row[0] == b"3" for row in rows):
+    faces = lines[vertex.rows : vertex.rows + face.rows]
+    if all(line.split(None, 1)[0] == b"3" for line in faces):
         return header, body
     columns = [names.index(axis) for axis in "xyz"]
     table = [line.split() for line in lines[: vertex.rows]]
     vertices = np.array([[float(row[column]) for column in columns] for row in table])
-    out = []
-    for row in rows:
-        size = int(row[0])
-        places, rest = row[1 : size + 1], row[size + 1 :]
-        if size > 2:
-            (split,) = triangulate(vertices[np.array(places, int)][None])
-            out += [b" ".join([b"3", *(places[i] for i in one), *rest]) for one in split]
-    header = re.sub(r"^(\s*element\s+face\s+)\d+", rf"\g<1>{len(out)}", header, flags=re.MULTILINE)
+    rows = [line.split() for line in faces]
+    corners = [row[1 : int(row[0]) + 1] for row in rows]
+    out = [
+        b" ".join([b"3", *(places[i] for i in triangle), *row[len(places) + 1 :]])
+        for row, places, triangles in zip(
+            rows, corners, _split_each(vertices, corners), strict=True
+        )
+        for triangle in triangles
+    ]
     first = body[: body.index(b"\n") + 1]
     after = lines[vertex.rows + face.rows :]
-    return header, first + b"\n".join([*lines[: vertex.rows], *out, *after]) + b"\n"
+    text = b"\n".join([*lines[: vertex.rows], *out, *after]) + b"\n"
+    return _count_faces(header, len(out)), first + text
 
 
 def list_elements(header: str) -> Iterator[Element]:
