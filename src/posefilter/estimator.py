@@ -2,10 +2,10 @@
 
 import time
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from numbers import Integral
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 import torch
@@ -21,32 +21,11 @@ from posefilter.instances.detect import detect
 from posefilter.instances.pixels import resize_mask
 from posefilter.limits import MOST_SIDE
 from posefilter.models.base import PoseEstimator
+from posefilter.precision import in_float32
 from posefilter.result import Result, Run, collect_results, make_result
 from posefilter.types import Batch, ObjectModel, Trace
 
 _MOST = 100  # instances of an object
-_F = TypeVar("_F", bound=Callable[..., Any])
-
-
-def without_autocast(function: _F) -> _F:
-    """Return a function that computes as precisely as it says, wherever it is called: geometry must
-    not be in half precision.
-    """
-    for device in ("cpu", "cuda"):
-        function = torch.autocast(device, enabled=False)(function)
-    return function
-
-
-def check_default_dtype() -> None:
-    """Refuse a default type of tensors in which networks and geometry do not fit together.
-
-    Raises:
-        UserError: It is not float32.
-    """
-    if torch.get_default_dtype() != torch.float32:
-        raise UserError(
-            f"torch.set_default_dtype({torch.get_default_dtype()}): posefilter needs torch.float32"
-        )
 
 
 class Estimator:
@@ -172,11 +151,10 @@ class Estimator:
         images, _ = check_images(rgb, depth, intrinsics)
         return collect_results(self.run(images, seed), self.costs, self.pose_tolerance)
 
-    @without_autocast
+    @in_float32
     def _detect(self, images: Images, counts: Sequence[int], seed: int) -> list[list[Result]]:
         """Find several instances: a list of results an image, the most probable first."""
         seed = check_seed(seed)
-        check_default_dtype()
         take_threads()
         for method in self.methods:
             method.seed = seed
@@ -214,14 +192,13 @@ class Estimator:
             out.append(results)
         return out
 
-    @without_autocast
+    @in_float32
     def run(self, images: Images, seed: int = 0) -> list[Run]:
         """Run each object's filter, and return every step of it: for figures of what it did.
 
         The trace's belief is the calibrated one, where there is one.
         """
         seed = check_seed(seed)
-        check_default_dtype()
         take_threads()
         runs, blank = [], list_blank(images)
         for method, size in zip(self.methods, self._sizes, strict=True):

@@ -8,6 +8,7 @@ import pytest
 import torch
 
 import posefilter
+from posefilter.deploy.write import write_filter
 from posefilter.errors import UserError
 from posefilter.images import as_array, check_images
 
@@ -35,11 +36,25 @@ def test_autocast_of_the_caller_changes_nothing(small: posefilter.Estimator) -> 
     assert np.array_equal(plain.pose, under.pose)
 
 
-def test_another_default_type_is_refused(small: posefilter.Estimator) -> None:
+def test_autocast_of_the_caller_changes_no_track(small: posefilter.Estimator) -> None:
+    plain, under = posefilter.Tracker(small), posefilter.Tracker(small)
+    for seed in range(2):
+        expected = plain.update(*make_image(seed), K)
+        with torch.autocast("cpu", torch.bfloat16):
+            found = under.update(*make_image(seed), K)
+        assert np.array_equal(expected.pose, found.pose)
+
+
+def test_another_default_type_is_refused(small: posefilter.Estimator, tmp_path: Path) -> None:
+    tracker, method = posefilter.Tracker(small), small.methods[0]
     torch.set_default_dtype(torch.float64)
     try:
         with pytest.raises(UserError, match=r"set_default_dtype\(torch\.float64\)"):
             small.predict(*make_image(), K)
+        with pytest.raises(UserError, match=r"set_default_dtype\(torch\.float64\)"):
+            tracker.update(*make_image(), K)
+        with pytest.raises(UserError, match=r"set_default_dtype\(torch\.float64\)"):
+            write_filter(method, tmp_path, 320, 240, "torch")
     finally:
         torch.set_default_dtype(torch.float32)
 

@@ -24,6 +24,7 @@ from posefilter.filters.initialize import FromObjectness
 from posefilter.models.base import PoseEstimator
 from posefilter.models.image_space import ImageSpace
 from posefilter.models.pose_pf import PosePF
+from posefilter.precision import in_float32
 
 FORMATS = ("onnx", "torch")
 OPSET = 18
@@ -58,6 +59,7 @@ def check_format(kind: str) -> None:
         raise missing_package("format=onnx", missing[0], "export")
 
 
+@in_float32
 def write_filter(method: PoseEstimator, folder: Path, width: int, height: int, kind: str) -> float:
     """Write `encode` and `measure`, and filter.json.
 

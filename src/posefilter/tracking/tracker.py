@@ -10,6 +10,7 @@ from posefilter.devices import take_threads
 from posefilter.errors import UserError, check_seed
 from posefilter.estimator import Estimator, get_trained_size
 from posefilter.images import Images, as_array, check_depth_unit, check_images, check_intrinsics
+from posefilter.precision import in_float32
 from posefilter.tracking.processes import MultiprocessTracker
 from posefilter.tracking.settings import TrackerSettings
 from posefilter.tracking.track import Track, TrackResult
@@ -107,6 +108,7 @@ class Tracker:
         results = self.update_all(rgb, depth, intrinsics)
         return results[0] if len(results) == 1 else results
 
+    @in_float32
     def update_all(self, rgb: Any, depth: Any, intrinsics: Any) -> list[TrackResult]:
         """Find each object in the next frame; as `update`, but always a list."""
         frame = Frame(self.check(rgb, depth, intrinsics))

@@ -1,0 +1,33 @@
+"""What is computed in, whatever the caller has set."""
+
+from collections.abc import Callable
+from functools import wraps
+from typing import Any, TypeVar
+
+import torch
+
+from posefilter.errors import UserError
+
+_F = TypeVar("_F", bound=Callable[..., Any])
+
+
+def in_float32(function: _F) -> _F:
+    """Return a function that computes in float32 wherever it is called, or in what it says itself:
+    a caller's autocast would put geometry into half precision.
+
+    Raises:
+        UserError: When it is called: the default type of tensors is another, in which networks and
+            geometry do not fit together.
+    """
+
+    @wraps(function)
+    def checked(*args: Any, **kwargs: Any) -> Any:
+        if torch.get_default_dtype() != torch.float32:
+            raise UserError(
+                f"torch.set_default_dtype({torch.get_default_dtype()}): posefilter needs "
+                "torch.float32"
+            )
+        with torch.autocast("cpu", enabled=False), torch.autocast("cuda", enabled=False):
+            return function(*args, **kwargs)
+
+    return checked  # type: ignore[return-value]
