@@ -28,13 +28,6 @@ MODELS = (*DETECTORS, *WITH_POSE)
 UNTRAINED = "optimizer.lr=0 trainer.max_steps=2 trainer.val_check_interval=2"
 # of the displacement, not stated in the paper; the first is the default
 UNITS = "model.displacement.unit=half_frame,10,1,learned"
-# ablations of more than one seed; the detectors' paper and working are in the table of
-# memorization, with all seeds
-TELLING = (
-    "paper,s4_displacement_loss,s5_position,s9_displacement_loss_and_position,c5_displacement_loss,"
-    "c6_position,c9_context,pose_c12_loss,working"
-)
-TELLING_BOX = "s2_bounded,c1_normalization,c6_position"
 # the paper with one modification, and the first two of the ladder: the others bound displacements
 UNBOUNDED = (
     "s1_glimpse,s3_balanced,s4_displacement_loss,s5_position,s6_informed,s7_context,s8_resample,"
@@ -135,11 +128,8 @@ def plan(meshes: str | None = None, frames: str | None = None) -> list[Line]:
             "seed=0,1,2",
         ),
     ]
-    for models, sweep, ablations in (
-        (WITH_POSE, "ablation", TELLING),
-        (DETECTORS, "ablation_detect", TELLING_BOX),
-    ):
-        seeds = f"experiment=memorize sweep={sweep} ablation={ablations} seed=1,2"
+    for models, sweep in ((WITH_POSE, "ablation"), (DETECTORS, "ablation_detect")):
+        seeds = f"experiment=memorize sweep={sweep} seed=1,2"
         lines += [Line(sweep, f"model={m} {seeds}", into=f"{m}_seeds") for m in models]
         long = (
             f"experiment=memorize sweep={sweep} ablation=paper trainer.max_steps=2000 "
@@ -296,11 +286,9 @@ def list_units_of_ablations() -> list[Line]:
     one at 10 pixels.
     """
     seeds = "seed=0,1,2"
-    others = ",".join(name for name in UNBOUNDED.split(",") if name not in TELLING.split(","))
     some = "model=patch_pf experiment=memorize sweep=ablation callbacks=checkpoints"
     lines = [
         Line("ablation_unit", f"{some} ablation={UNBOUNDED} model.displacement.unit=1,10 {seeds}"),
-        Line("ablation", f"{some} ablation={others} seed=1,2", into="patch_pf_more_seeds"),
     ]
     for model in DETECTORS:
         bounded = SMALL_BOXES.format(model, "s2_bounded")

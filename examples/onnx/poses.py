@@ -479,7 +479,8 @@ def read_arguments(particles):
     if len(sys.argv) != 6:
         sys.exit(f"usage: {particles}.py FOLDER RGB DEPTH fx,fy,cx,cy DEPTH_UNITS_A_METER")
     folder, rgb, depth, intrinsics, scale = sys.argv[1:]
-    if not all((Path(folder) / name).is_file() for name in ("filter.json", "encode.onnx")):
+    files = "filter.json", "encode.onnx", "measure.onnx"
+    if not all((Path(folder) / name).is_file() for name in files):
         sys.exit(f"{folder}: no folder that export.py format=onnx wrote")
     own = json.loads((Path(folder) / "filter.json").read_text())["particles_are"]
     if own != particles:
@@ -489,7 +490,9 @@ def read_arguments(particles):
         units = float(scale)
     except ValueError:
         sys.exit(f"{intrinsics} {scale}: expected fx,fy,cx,cy [px] and the units in a meter")
-    if not units > 0:
+    if not (np.isfinite([fx, fy, cx, cy]).all() and fx > 0 and fy > 0):
+        sys.exit(f"{intrinsics}: fx and fy must be above 0, and all four be numbers")
+    if not 0 < units < np.inf:
         sys.exit(f"{scale}: expected the depth image's units in a meter, above 0")
     color = cv2.imread(rgb, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
     z = cv2.imread(depth, cv2.IMREAD_UNCHANGED)
@@ -500,9 +503,13 @@ def read_arguments(particles):
         sys.exit(f"{depth}: has {z.shape[2]} channels, and depth has one")
     if z.dtype == np.uint16:
         z[z == 65535] = 0  # saturated, and no measurement
+        z = z / units
+    elif z.dtype != np.float32:
+        sys.exit(f"{depth}: is of {z.dtype}; depth is uint16, or float32 in meters")
+    z = np.where(np.isfinite(z), z, 0)
     if not z.any():
         sys.exit(f"{depth}: no pixel has depth")
-    color, z = cv2.cvtColor(color, cv2.COLOR_BGR2RGB), z / units
+    color = cv2.cvtColor(color, cv2.COLOR_BGR2RGB)
     if not 0.05 <= (median := np.median(z[z > 0])) <= 30:
         sys.exit(f"{scale}: the median depth would be {median:.3g} m; is it 1000 or 10000?")
     return folder, color, z, np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])

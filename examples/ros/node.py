@@ -8,6 +8,7 @@ how to install both.  The tests run it with stand-ins for ROS's packages.
         -r depth:=/camera/aligned_depth_to_color/image_raw
 """
 
+import sys
 from collections import Counter
 from contextlib import suppress
 from queue import Empty, Queue
@@ -54,6 +55,7 @@ class PoseNode(Node):
         self.tracker = posefilter.Tracker(posefilter.load(checkpoints))
         self.publisher = self.create_publisher(Detection3DArray, "detections", 10)
         self.newest: Queue[Any] = Queue(maxsize=1)
+        self.error: BaseException | None = None  # that ended the worker
         self.seen: Counter[str] = Counter()
         topics = [self.listen(name) for name in _KINDS]
         self.sync = message_filters.ApproximateTimeSynchronizer(topics, _WAITING, self.slop)
@@ -81,6 +83,9 @@ class PoseNode(Node):
         try:
             while (messages := self.newest.get()) is not None:
                 self.answer(*messages)
+        except BaseException as error:
+            self.error = error
+            raise
         finally:
             rclpy.try_shutdown()  # after an error here: a node that only listens helps nobody
 
@@ -151,19 +156,25 @@ def make_pose(pose: np.ndarray) -> Pose:
     return Pose(position=Point(x=x, y=y, z=z), orientation=Quaternion(x=qx, y=qy, z=qz, w=qw))
 
 
-def main() -> None:
-    """Run until interrupted."""
+def main() -> int:
+    """Run until interrupted; the status is 0, 1 after an error, or 2 if the node cannot start."""
     rclpy.init()
-    node = PoseNode()
+    node = None
     try:
+        node = PoseNode()
         rclpy.spin(node)
     except (KeyboardInterrupt, ExternalShutdownException):
         pass
+    except posefilter.UserError as error:
+        print(error, file=sys.stderr)
+        return 2
     finally:
-        node.close()
-        node.destroy_node()
+        if node is not None:
+            node.close()
+            node.destroy_node()
         rclpy.try_shutdown()  # a signal has shut down already, and shutdown() would raise
+    return 0 if node is None or node.error is None else 1
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())

@@ -227,6 +227,11 @@ class Result:
             return "it was calibrated by an earlier version, without sets"
         return "their guarantee is of one search of the whole image, not of instances"
 
+    @property
+    def shown_pose(self) -> np.ndarray | None:
+        """The pose (4, 4) that pictures show; None where the object is absent."""
+        return None if self.verdict == "absent" else self.pose
+
     def draw_overlay(self, rgb: Any, intrinsics: Any, shape: "Shape | None" = None) -> np.ndarray:
         """Draw the object's outline and axes on the image that it was found in: full where it is
         found, dashed where the verdict is unsure, none where it is absent.
@@ -245,9 +250,8 @@ class Result:
         from posefilter.figures.overlay import draw_overlay  # slow to import, needed for pictures
 
         shape = self.object_model.hull if shape is None else shape
-        pose = None if self.verdict == "absent" else self.pose
-        unsure = self.verdict == "unsure"
-        return draw_overlay(rgb, intrinsics, pose, shape, caption=self.describe(), dashed=unsure)
+        pose, words, unsure = self.shown_pose, self.describe(), self.verdict == "unsure"
+        return draw_overlay(rgb, intrinsics, pose, shape, caption=words, dashed=unsure)
 
     def describe(self) -> str:
         """Return the verdict in a few words: `003_cracker_box: found, probability 0.97`."""

@@ -424,6 +424,10 @@ def test_the_examples_import_neither_torch_nor_us(name: str) -> None:
         (["poses", "a.png", "d.png", "1,1,1,1", "1"], "a.png: no image that OpenCV reads"),
         (["poses", "c.png", "c.png", "1,1,1,1", "1"], "c.png: has 3 channels, and depth has one"),
         (["poses", "c.png", "0.png", "1,1,1,1", "1"], "0.png: no pixel has depth"),
+        (["poses", "c.png", "8.png", "1,1,1,1", "1"], "8.png: is of uint8; depth is uint16, or"),
+        (["poses", "c.png", "d.png", "nan,1,1,1", "1"], "nan,1,1,1: fx and fy must be above 0"),
+        (["poses", "c.png", "d.png", "1,-1,1,1", "1"], "1,-1,1,1: fx and fy must be above 0"),
+        (["poses", "c.png", "d.png", "1,1,1,1", "inf"], "inf: expected the depth image's units"),
         (["poses", "c.png", "d.png", "1,1,1,1", "1"], "1: the median depth would be 700 m; is it"),
         (["poses", "c.png", "d.png", "1,1,1,1", "1e5"], "1e5: the median depth would be 0.007 m"),
     ],
@@ -434,11 +438,13 @@ def test_the_examples_mistakes_are_one_line(
     for name in ("poses", "pixels"):
         (tmp_path / name).mkdir()
         (tmp_path / name / "filter.json").write_text(json.dumps({"particles_are": name}))
-        (tmp_path / name / "encode.onnx").touch()
+        for graph in ("encode", "measure"):
+            (tmp_path / name / f"{graph}.onnx").touch()
     (tmp_path / "cut_short").mkdir()  # the settings without the networks
     (tmp_path / "cut_short" / "filter.json").write_text(json.dumps({"particles_are": "poses"}))
     depth = np.full((6, 8), 700, np.uint16)
-    for name, image in (("c", np.zeros((6, 8, 3), np.uint8)), ("d", depth), ("0", 0 * depth)):
+    color, shown = np.zeros((6, 8, 3), np.uint8), np.full((6, 8), 70, np.uint8)
+    for name, image in (("c", color), ("d", depth), ("0", 0 * depth), ("8", shown)):
         cv2.imwrite(str(tmp_path / f"{name}.png"), image)
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("sys.argv", ["poses.py", *typed])

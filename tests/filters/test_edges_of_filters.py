@@ -306,3 +306,11 @@ def test_weights_of_three_kinds_by_hand() -> None:
     assert CurrentLikelihood()(before, now, then)[0].tolist() == pytest.approx(
         [0.5 - math.log(2), 0.25 - math.log(2)]
     )
+
+
+def test_what_was_impossible_stays_so_by_the_ratio() -> None:
+    none, some = -math.inf, torch.tensor([[0.5, 0.25]])
+    then = torch.tensor([[none, 1.0]])
+    for before in ([[none, 0.0]], [[-1.0, 0.0]]):  # kept, and drawn anew by a soft resampling
+        weights = LikelihoodRatio()(torch.tensor(before), some, then)
+        assert weights.tolist() == [[none, -0.75]]

@@ -115,8 +115,12 @@ def test_widened_turns_end_before_they_wrap_round() -> None:
 
 
 @pytest.mark.parametrize(
-    "wrong", [{"samples": 0}, {"rounds": 0}, {"widening": 0.5}, {"temperature": 0.0}]
-)
+    "wrong",
+    [
+        {"samples": 0}, {"rounds": 0}, {"widening": 0.5}, {"temperature": 0.0},
+        {"sigma": 0.0}, {"pixels": 0}, {"min_effective": 2.0}, {"min_effective": -0.1},
+    ],
+)  # fmt: skip
 def test_numbers_out_of_range_are_refused(wrong: dict[str, float]) -> None:
     with pytest.raises(UserError, match="importance sampling needs"):
         ImportanceSampling(**wrong)  # type: ignore[arg-type]

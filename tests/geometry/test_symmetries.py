@@ -2,14 +2,16 @@
 
 import math
 
+import numpy as np
 import pytest
 import torch
 from torch import Tensor
 
-from posefilter.geometry.pose import make_pose, move_about
+from posefilter.geometry.pose import make_pose, move_about, origin_of, rotation_of
 from posefilter.geometry.pose_statistics import twist_between
 from posefilter.geometry.rotation import exp_so3, random_rotation
 from posefilter.geometry.symmetries import densify, gather_copies
+from posefilter.meshes.symmetries import symmetry_group
 
 CENTER, RADIUS = torch.tensor([0.01, -0.02, 0.03], dtype=torch.float64), 0.1
 
@@ -37,3 +39,17 @@ def test_a_copy_is_the_nearest_of_all_that_symmetries_make(count: int, noise: fl
     length = (twist_between(about, copies, CENTER) * unit).norm(dim=-1)
     nearest = copies[torch.arange(50), length.argmin(1)]
     assert torch.allclose(found, nearest, rtol=0, atol=1e-12)
+
+
+def test_of_a_ball_the_copy_is_turned_as_the_pose_that_it_is_compared_to() -> None:
+    lines = [
+        (np.array([1.0, 0, 0]), np.array([0.3, 0.05, 0.02])),
+        (np.array([0.0, 0.8, 0.6]), np.array([0.1, 0.13, 0.08])),
+    ]
+    group = torch.from_numpy(symmetry_group(continuous=lines, steps=36))
+    middle = torch.tensor([0.1, 0.05, 0.02], dtype=torch.float64)  # of the ball
+    about = make_pose(random_rotation().double(), torch.tensor([0.0, 0.0, 1.0]).double())
+    poses = make_pose(random_rotation(20).double(), torch.randn(20, 3).double())
+    found = gather_copies(poses, about, CENTER, RADIUS, group)
+    assert torch.allclose(rotation_of(found), rotation_of(about).expand(20, 3, 3))
+    assert torch.allclose(origin_of(found, middle), origin_of(poses, middle), atol=1e-9)

@@ -8,7 +8,7 @@ import os
 import signal
 import struct
 import zlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -721,11 +721,52 @@ def test_images_without_times_are_paired_by_the_time_of_recording(tmp_path: Path
         assert told.startswith("headers of /rgb have no time")
 
 
+def read_pairs(path: Path) -> tuple[list[tuple[int, int]], list[str]]:
+    """Return the numbers of the color and of the depth image of each pair, and the warnings."""
+    with BagReader(path, TOPICS, 0.01) as reader:
+        pairs = [
+            (int(one.rgb[0, 0, 0]), round(1000 * float(one.depth[0, 0])) - 1000)
+            for one in reader.frames()
+        ]
+        return pairs, reader.warnings
+
+
+def make_stream(first: int, times: Sequence[int], lag: int, stamped: bool) -> list[Any]:
+    """Return messages of numbered images, each depth image `lag` ms after its color."""
+    stream = []
+    for number, time in enumerate(times):
+        rgb, depth = np.full((4, 4, 3), number, np.uint8), np.full((4, 4), 1000 + number, np.uint16)
+        stamps = (time, time + lag) if stamped else (0, 0)
+        if number >= first:
+            stream.append(("/rgb", IMAGE, time, make_image(rgb, "rgb8", stamps[0])))
+        stream.append(("/depth", IMAGE, time + lag, make_image(depth, "16UC1", stamps[1])))
+    return sorted(stream, key=lambda one: one[2])
+
+
+def test_images_without_times_that_alternate_are_paired_by_recording(tmp_path: Path) -> None:
+    info = ("/info", CAMERA_INFO, 0, make_info(np.float64([[100, 0, 2], [0, 100, 2], [0, 0, 1]])))
+    times = range(100, 600, 100)
+    # the bag begins with a depth image whose color came before
+    bag = write_bag(tmp_path / "a", [info, *make_stream(1, times, 2, stamped=False)])
+    pairs, warnings = read_pairs(bag)
+    assert pairs == [(1, 1), (2, 2), (3, 3), (4, 4)]
+    assert "have no time" in warnings[0]
+    bag = write_bag(tmp_path / "b", [info, *make_stream(0, times, 49, stamped=False)])
+    assert read_pairs(bag)[0] == []
+    # a single pair
+    bag = write_bag(tmp_path / "c", [info, *make_stream(0, [100], 2, stamped=False)])
+    pairs, warnings = read_pairs(bag)
+    assert (pairs, len(warnings)) == ([(0, 0)], 1)
+    # a simulation's clock begins at 0
+    bag = write_bag(tmp_path / "d", [info, *make_stream(0, range(0, 300, 100), 0, stamped=True)])
+    assert read_pairs(bag) == ([(0, 0), (1, 1), (2, 2)], [])
+
+
 def test_depth_of_another_frame_is_told(tmp_path: Path) -> None:
     rgb, depth, K = read_scene()
-    aligned, far = make_image(depth, "16UC1"), make_image(depth, "16UC1")
+    aligned, far = make_image(depth, "16UC1", 2), make_image(depth, "16UC1", 2)
     far.header.frame_id = "camera_depth_optical"
-    color = make_image(rgb, "rgb8")
+    color = make_image(rgb, "rgb8", 1)
     messages = [("/info", CAMERA_INFO, 0, make_info(K)), ("/rgb", IMAGE, 1, color)]
     warnings = []
     for name, image in (("a", aligned), ("b", far)):

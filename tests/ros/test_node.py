@@ -196,7 +196,7 @@ def test_silence_is_told(example: dict[str, Any]) -> None:
 
 def test_a_signal_ends_it_without_an_error(example: dict[str, Any]) -> None:
     before = threading.enumerate()
-    example["main"]()
+    assert example["main"]() == 0
     assert set(threading.enumerate()) <= set(before)
 
 
@@ -210,8 +210,20 @@ def test_an_error_of_the_worker_ends_the_node(example: dict[str, Any]) -> None:
         node.sync.send(*make_messages(1))
         assert ended.wait(60)
         node.close()
+        assert isinstance(node.error, TypeError)
     finally:
         threading.excepthook = hook
+
+
+def test_a_node_that_cannot_start_says_why_in_one_line(
+    example: dict[str, Any], monkeypatch, capsys
+) -> None:
+    def fail(*_: object) -> None:
+        raise posefilter.UserError("checkpoint=nothing.ckpt: no such file")
+
+    monkeypatch.setattr(posefilter, "load", fail, raising=False)
+    assert example["main"]() == 2
+    assert capsys.readouterr().err == "checkpoint=nothing.ckpt: no such file\n"
 
 
 def test_detections_are_those_of_bags(example: dict[str, Any]) -> None:

@@ -157,6 +157,10 @@ def test_a_loss_is_noticed_and_the_object_recovered_elsewhere() -> None:
         result = tracker.update(RGB, DEPTH, K)
         statuses.append(result.status)
         assert result.is_tracked == (result.status != "lost")
+        # a pose that is a guess is not drawn, and one that was not measured has no score
+        assert (result.shown_pose is None) == (result.describe() == "toy: lost")
+        assert (result.shown_pose is None) == (result.status == "lost")
+        assert (result.score == -math.inf) == (away and number > 0)
         if result.is_tracked and not away:
             assert off(result, pose) < 0.01
     assert statuses[8:10] == ["tracked", "lost"]  # two frames without it are a loss

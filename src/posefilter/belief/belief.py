@@ -36,7 +36,7 @@ from posefilter.geometry.pose_density import (
 )
 from posefilter.geometry.pose_statistics import covariance_about, twist_between
 from posefilter.geometry.spaces import PoseSpace
-from posefilter.geometry.symmetries import densify, gather_copies, spread_turns
+from posefilter.geometry.symmetries import densify, gather_copies
 from posefilter.types import ObjectModel
 
 _MOST_SYMMETRIES = 10_000  # as many as an object may have (meshes/symmetries.py)
@@ -290,8 +290,9 @@ class Belief:
             coverage: What the set is made for, which it states and does not compute.
             min_log_density: The threshold [nat]; minus infinity gives the set of all poses.
         """
-        inside = self._density.chosen.numpy()[self._held_out >= min_log_density]
-        samples, weights = self.samples[inside], self.weights[inside]
+        inside = self._held_out >= min_log_density
+        samples = self.samples[self._density.chosen.numpy()[inside]]
+        weights = self._density.log_weights.exp().numpy()[inside]
         return PoseSet(coverage, min_log_density, samples, weights, self.log_density)
 
     def contains(self, poses: np.ndarray, level: float = 0.9) -> np.ndarray:
@@ -474,10 +475,6 @@ class Belief:
     def _density(self) -> PoseDensity:
         samples, weights = self._tensors
         own, group = torch.from_numpy(self.center), torch.from_numpy(self.symmetries)
-        dense = densify(group)
-        if len(dense) > len(group):  # however the samples are turned about the axis
-            about = samples[weights.argmax()]
-            samples = spread_turns(gather_copies(samples, about, own, self.radius, dense), group)
         return fit_density(samples, weights.log(), own, self.radius, self.diameter, group)
 
     @cached_property
@@ -503,8 +500,9 @@ class Belief:
         return Modes(states[order], masses[order], order.argsort()[member])
 
     def _is_equivalent(self, found: Modes, heavier: int, pose: Tensor) -> bool:
-        copies = found.states[heavier] @ torch.from_numpy(self.symmetries)
-        return bool(self._space.distance(copies, pose).min() < APART * self.diameter)
+        center, group = torch.from_numpy(self.center), densify(torch.from_numpy(self.symmetries))
+        copy = gather_copies(found.states[heavier][None], pose, center, self.radius, group)
+        return bool(self._space.distance(copy, pose)[0] < APART * self.diameter)
 
     def _list_alike(self) -> list[int]:
         """Return the numbers of the heaviest mode and of those that symmetries make of it."""

@@ -15,9 +15,9 @@ class PoseSet:
             belief's mass or frames, is its maker's matter (credible or conformal).
         min_log_density: The threshold: the least log density of a pose in the set; minus infinity
             where every pose is in it.
-        samples: The particles in it (K, 4, 4), camera_from_object [m]; of more than 2,000 particles
-            a selection.
-        weights: Their weights (K,) in the belief.
+        samples: The particles in it (K, 4, 4), camera_from_object [m], one of those that are the
+            same; of more than 2,000 particles a selection.
+        weights: Their weights (K,) in the belief, with those that they stand for.
         log_density: The belief's log density at poses; see `Belief.log_density`.
     """
 

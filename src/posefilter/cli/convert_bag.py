@@ -48,7 +48,7 @@ def convert_bag(job: Job) -> None:
         tally = Tally(dict.fromkeys(estimator.objects, 0))
         watch = bars(shown=cfg.console != JSON, transient=True)
         with BagWriter(out, str(cfg.detections)) as writer, watch as bar:
-            task = bar.add_task("images", total=reader.images)
+            task, copying = bar.add_task("images", total=reader.images), False
             if cfg.copy_messages:
                 writer.add_connections(reader.reader.connections)  # first: it may be refused
             try:
@@ -69,10 +69,16 @@ def convert_bag(job: Job) -> None:
                 if not tally.images:
                     raise UserError(f"bag={cfg.bag}: {reader.explain_none()}")
                 if cfg.copy_messages:
+                    copying = True
                     writer.copy(reader.messages())
             except (UserError, KeyboardInterrupt, Stopped) as error:
                 kept = f"the {writer.count} images before it are in {out}"
-                kept += ", without the messages of the bag" if cfg.copy_messages else ""
+                if copying:
+                    kept = (
+                        f"all {writer.count} images and a part of the bag's messages are in {out}"
+                    )
+                elif cfg.copy_messages:
+                    kept += ", without the messages of the bag"
                 if writer.count and isinstance(error, UserError):
                     raise UserError(f"{error}; {kept}") from error
                 if writer.count:

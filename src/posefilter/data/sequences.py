@@ -155,7 +155,10 @@ class FolderVideo(Video):
             self._size, self._sized = self._find_size()
         expect_size(color, rgb, *self._size, self._sized)
         if self._distortion is not None:
-            rgb, z = undistort_most(rgb, z, self._K, self._distortion)
+            try:
+                rgb, z = undistort_most(rgb, z, self._K, self._distortion)
+            except UserError as error:
+                raise UserError(f"frame {color.stem}: {error}") from error
         return VideoFrame(color.stem, number, rgb, z, self._K, {})
 
     def _find_size(self) -> tuple[tuple[int, int], str]:

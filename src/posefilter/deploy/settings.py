@@ -77,7 +77,7 @@ def check_method(method: PoseEstimator) -> None:
         raise UserError(f"{type(method).__name__} detects, and estimates no pose to be exported")
     if isinstance(method, ImageSpace):
         return
-    if not isinstance(method, PosePF):
+    if not isinstance(method, PosePF) or type(method).measure is not PosePF.measure:
         raise UserError(f"format: the networks of {type(method).__name__} cannot be exported")
     likelihood = method.likelihood
     contextual = isinstance(likelihood, PoseLikelihood) and likelihood.context is not None

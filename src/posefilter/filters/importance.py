@@ -70,6 +70,11 @@ class ImportanceSampling:
                 f"refine: importance sampling needs samples and rounds >= 1, widening >= 1 and "
                 f"temperature > 0, got {self.samples}, {self.rounds}, {widening} and {temperature}"
             )
+        if not (self.sigma > 0 and self.pixels >= 1 and 0 <= self.min_effective <= 1):
+            raise UserError(
+                "refine: importance sampling needs sigma > 0, pixels >= 1 and min_effective in "
+                f"[0, 1], got {self.sigma}, {self.pixels} and {self.min_effective}"
+            )
 
     @torch.no_grad()
     def __call__(

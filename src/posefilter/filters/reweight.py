@@ -54,5 +54,6 @@ class LikelihoodRatio:
     def __call__(
         self, log_weights: Tensor, log_likelihood: Tensor, ancestor_log_likelihood: Tensor
     ) -> Tensor:
-        """Return (B, N)."""
-        return log_weights + log_likelihood - ancestor_log_likelihood
+        """Return (B, N); -inf where the ancestor's likelihood was zero, and so its weight."""
+        weights = log_weights + log_likelihood - ancestor_log_likelihood
+        return weights.masked_fill(ancestor_log_likelihood.isneginf(), -math.inf)

@@ -33,7 +33,7 @@ from posefilter.geometry.pose_kernels import (
     split_poses,
     whiten_kernels,
 )
-from posefilter.geometry.symmetries import gather_copies
+from posefilter.geometry.symmetries import densify, gather_copies, spread_turns
 
 BACKGROUND = 0.01  # of the mass
 _SHARES = (0.1, 0.3, 1.0)  # of the poses that are neighbors
@@ -49,13 +49,12 @@ _CHUNK = 1 << 17  # pairs of poses held at once
 class PoseDensity(NamedTuple):
     """A density over poses; made by `fit_density`, evaluated by `log_density`."""
 
-    chosen: Tensor  # (N,) which of the poses that were given have a kernel
+    chosen: Tensor  # (N,) which of the poses that were given have a kernel; of copies the first
     matrices: Tensor  # (N, 4, 4) their poses, or copies of them that symmetries make
     poses: TwistParts  # the same
     log_weights: Tensor  # (N,), normalized
     whiten: Tensor  # (N, 6, 6) maps a twist of a kernel to a standard normal vector
     log_scale: Tensor  # (N,) log of the kernels' normalization
-    twin: Tensor  # (N,) int64, equal where poses are copies of one another
     symmetries: Tensor  # (S, 4, 4) object_from_object
     center: Tensor  # (3,) of the object, in its frame [m]
     mean: Tensor  # (3,) position of the background [m]
@@ -74,6 +73,9 @@ def fit_density(
 ) -> PoseDensity:
     """Fit a kernel density to weighted poses.
 
+    Poses that are the same, which resampling makes, have one kernel of their weight: they tell no
+    more of the distribution than one does.
+
     Args:
         poses: (N, 4, 4) camera_from_object [m].
         log_weights: (N,), normalized.
@@ -81,7 +83,8 @@ def fit_density(
         radius: Distance at which a turn counts as the shift that it causes [m].
         diameter: Of the object [m].
         symmetries: (S, 4, 4) object_from_object, a group: a pose and what a symmetry makes of it
-            are one, and share the density equally.  None: the identity alone.
+            are one, and share the density equally.  Turns that stand for a continuous symmetry
+            count as all that lie between them.  None: the identity alone.
         max_kernels: Number of kernels.  Of more poses the heaviest have kernels of their own, and
             an even selection of the others stands for these.
         member: (N,) int64, the mode of each pose.  A kernel's covariance may then be that of its
@@ -93,13 +96,18 @@ def fit_density(
     poses, log_weights, center = poses.double(), log_weights.double(), center.to(poses).double()
     group = torch.eye(4)[None] if symmetries is None else symmetries
     group = group.to(poses)
-    chosen, log_weights = _thin(log_weights, max_kernels)
+    first, log_weights = _merge(poses, log_weights)
+    kept, log_weights = _thin(log_weights, max_kernels)
+    chosen = first[kept]
     poses = poses[chosen]
-    twin = poses.flatten(1).unique(dim=0, return_inverse=True)[1]
+    dense = densify(group)
+    if len(dense) > len(group):  # however the poses are turned about the axis
+        about = poses[log_weights.argmax()]
+        poses = spread_turns(gather_copies(poses, about, center, radius, dense), group)
     canonical = gather_copies(poses, poses[log_weights.argmax()], center, radius, group)
     parts = split_poses(canonical, center)
     mean = (log_weights.exp()[:, None] * parts.center).sum(0)
-    fixed = (twin, group, center, mean, diameter)
+    fixed = (group, center, mean, diameter)
     unit = poses.new_tensor([1.0] * 3 + [radius] * 3)
     count = len(poses)
     judged = log_weights.topk(min(count, _JUDGED)).indices
@@ -142,8 +150,7 @@ def log_density_held_out(density: PoseDensity) -> Tensor:
     """Return the log density at the kernels' own poses, each without its own kernel.
 
     A kernel is highest at its own pose, so that with it a pose of the fit would seem likelier than
-    a new one of the same distribution.  The kernels of its copies are left out, too, which
-    resampling makes: they tell no more of the distribution.
+    a new one of the same distribution.
 
     -> (N,) float64.
     """
@@ -171,7 +178,7 @@ def _mix(density: PoseDensity, log_kernel: Tensor, center: Tensor, own: Tensor |
         density: The kernels.
         log_kernel: (N, M) log densities of the kernels there.
         center: (M, S, 3) positions there, of each copy that symmetries make.
-        own: (M,) the kernel of each pose, which is left out with its copies; None: none is.
+        own: (M,) the kernel of each pose, which is left out; None: none is.
 
     Returns:
         (M,).
@@ -179,10 +186,8 @@ def _mix(density: PoseDensity, log_kernel: Tensor, center: Tensor, own: Tensor |
     joint = density.log_weights[:, None] + log_kernel
     if own is None:
         return _with_background(density, joint.logsumexp(0), center - density.mean)
-    joint = joint.masked_fill(density.twin[:, None] == density.twin[own], -torch.inf)
-    weights = density.log_weights.exp()
-    mass = torch.zeros_like(weights).index_add(0, density.twin, weights)[density.twin[own]]
-    others = (-mass.clamp_max(1)).log1p().clamp_min(_LOG_NONE)
+    joint[own, torch.arange(len(own), device=own.device)] = -torch.inf
+    others = (-density.log_weights[own].exp().clamp_max(1)).log1p().clamp_min(_LOG_NONE)
     return _with_background(density, joint.logsumexp(0) - others, center - density.mean)
 
 
@@ -205,6 +210,19 @@ def _measure(density: PoseDensity, twist: Tensor) -> tuple[Tensor, Tensor]:
     # dR = 2 (1 - cos a) / a^2 d(rotation vector) = sinc^2(a / 2) d(rotation vector)
     half = torch.sinc(angle / (2 * math.pi)).clamp_min(1e-9)
     return square, 2 * half.log() - _LOG_UNITS
+
+
+def _merge(poses: Tensor, log_weights: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the first of each kind of equal poses (N, 4, 4), in order, and its log weight."""
+    kind = poses.flatten(1).unique(dim=0, return_inverse=True)[1]
+    every = torch.arange(len(kind), device=kind.device)
+    count = int(kind.max()) + 1
+    if count == len(kind):
+        return every, log_weights
+    first = torch.full_like(every[:count], len(kind)).scatter_reduce(0, kind, every, "amin")
+    first, order = first.sort()
+    weights = log_weights.new_zeros(count).index_add(0, kind, log_weights.exp())
+    return first, weights[order].log()
 
 
 def _thin(log_weights: Tensor, max_kernels: int) -> tuple[Tensor, Tensor]:

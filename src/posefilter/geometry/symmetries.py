@@ -101,16 +101,21 @@ def list_equivalent(poses: Tensor, truth: Tensor, symmetries: Tensor) -> Tensor:
     symmetries = symmetries.to(truth)
     if not is_ball(symmetries):
         return truth[..., None, :, :] @ symmetries
-    # the center is where each rotation leaves it: (I - R) c = t, least squares
-    R, t = rotation_of(symmetries), translation_of(symmetries)
-    center = torch.linalg.pinv((torch.eye(3).to(R) - R).flatten(0, 1)) @ t.flatten()
+    center = find_center(symmetries)
     return pose_about(rotation_of(poses), origin_of(truth, center), center)[..., None, :, :]
+
+
+def find_center(symmetries: Tensor) -> Tensor:
+    """Return the point that symmetries (S, 4, 4) of a ball leave where it is.  -> (3,)."""
+    R, t = rotation_of(symmetries), translation_of(symmetries)  # (I - R) c = t, least squares
+    return torch.linalg.pinv((torch.eye(3).to(R) - R).flatten(0, 1)) @ t.flatten()
 
 
 def gather_copies(
     poses: Tensor, about: Tensor, center: Tensor, radius: float, group: Tensor
 ) -> Tensor:
-    """Return of each pose the equivalent one that lies nearest to a pose.
+    """Return of each pose the equivalent one that lies nearest to a pose: of a ball the one that is
+    turned as it is.
 
     Args:
         poses: (N, 4, 4) camera_from_object [m].
@@ -124,6 +129,10 @@ def gather_copies(
     """
     if len(group) == 1:
         return poses
+    if is_ball(group):
+        own = find_center(group)
+        rotation = rotation_of(about).expand_as(rotation_of(poses))
+        return pose_about(rotation, origin_of(poses, own), own)
     # N S matrices would take long: an angle takes no more than the real part of a quaternion
     relative = quat_xyzw_from_matrix(rotation_of(about).mT @ rotation_of(poses))
     turns = quat_xyzw_from_matrix(rotation_of(group))

@@ -146,6 +146,7 @@ class BagReader:
         colors: deque[tuple[int, int, Any]] = deque(maxlen=_WAITING)
         depths: deque[tuple[int, int, Any]] = deque(maxlen=_WAITING)
         camera: Any = None
+        last: dict[str, int] = {}  # a first time of 0 may be a simulation's; a second one is none
         for connection, time, raw in self.messages():
             if connection.topic not in self.topics:
                 continue
@@ -160,11 +161,15 @@ class BagReader:
                 continue
             own = colors if connection.topic == self.topics.color else depths
             self.unpaired += own is colors and len(own) == _WAITING
-            own.append((time if self._by_recording else stamp_of(message), time, message))
-            if len(own) > 1 and own[-1][0] == own[-2][0] == 0:
+            stamp = time if self._by_recording else stamp_of(message)
+            own.append((stamp, time, message))
+            if not self._by_recording and stamp == last.get(connection.topic) == 0:
                 self._go_by_recording(colors, depths, connection.topic)
-            if camera is not None:
+            last[connection.topic] = stamp
+            if camera is not None and (self._by_recording or 0 not in last.values()):
                 yield from self._pair(colors, depths, camera)
+        if not self._by_recording and last and not any(last.values()):  # no image has one
+            self._go_by_recording(colors, depths, next(iter(last)))
         if camera is not None:
             yield from self._pair(colors, depths, camera, ended=True)
         self.unpaired += len(colors)

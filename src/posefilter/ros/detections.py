@@ -36,8 +36,13 @@ def to_ros_covariance(covariance: np.ndarray, pose: np.ndarray, center: np.ndarr
 
 
 def list_shown(results: Sequence[Result]) -> list[Result]:
-    """Return the results of objects that are not absent; of tracks, those that are not lost."""
-    return [one for one in results if getattr(one, "is_tracked", one.verdict != "absent")]
+    """Return the results of objects that are not absent; of tracks, those that are not lost, in an
+    image that can be judged: in another one the pose is predicted, and a detection cannot say so.
+    """
+    return [
+        one for one in results
+        if not one.blank and getattr(one, "is_tracked", one.verdict != "absent")
+    ]  # fmt: skip
 
 
 def choose_score(result: Result) -> float:

@@ -101,7 +101,9 @@ class ConstantVelocity:
         return math.sqrt(max(1.0, squared_innovation))
 
     def _measure(self, motion: Tensor) -> Tensor:
-        """Return the mean squares (2,) of shift and turn, in standard deviations."""
+        """Return the mean squares (2,) of shift and turn, in standard deviations; an axis without
+        noise counts as still.
+        """
         scale = motion.new_tensor([x or math.inf for x in self.scale])
         return (motion[0] / scale).square().view(2, 3).mean(1)
 

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -56,7 +57,7 @@ class TrackResult(Result):
     """Where a tracked object is in a frame.
 
     Attributes:
-        status: "started" by an estimate on a single image, "tracked" from the frame before,
+        status: "started" where it is found for the first time, "tracked" from the frame before,
             "recovered" after a loss, or "lost": then the pose is no more than a guess.
         objectness: What the network says of the pixels that the object covers: the mean probability
             that they show it. Occlusion lowers it. It is not calibrated.
@@ -65,7 +66,9 @@ class TrackResult(Result):
     The belief is calibrated by what errors of single images taught, where the frame was measured.
     `presence` and `probability` are those of an estimate on a single image with the same features,
     lowered where a lost object would be elsewhere than where something covered it; a track is
-    judged lost or recovered by the presence.
+    judged lost or recovered by the presence.  Where the presence is too low for the estimate to be
+    trusted, they and the features are that estimate's, the pose is the predicted one, and the score
+    is -inf.
     """
 
     status: str
@@ -92,6 +95,15 @@ class TrackResult(Result):
         """
         within = super().probability_within(pose_tolerance)
         return within if self.presence is None else min(within, self.presence)
+
+    @property
+    def shown_pose(self) -> np.ndarray | None:
+        """The pose as of `Result`; None where the object is lost."""
+        return super().shown_pose if self.is_tracked else None
+
+    def describe(self) -> str:
+        """Return the verdict in a few words, as of `Result`; of a lost object that it is lost."""
+        return super().describe() if self.is_tracked else f"{self.object}: lost"
 
     @property
     def _why_no_sets(self) -> str:
@@ -529,7 +541,7 @@ class Track:
             one, zero = ahead[None], ahead.new_zeros(1)
             state = begin(BeliefBatch(one[None], zero[None], one, zero))
         score = state.best.new_full((1,), -torch.inf)
-        score = score if sight.belief is None else sight.belief.score
+        score = sight.belief.score if measured and sight.belief is not None else score
         belief = BeliefBatch(state.belief.state, state.belief.log_weights, state.best, score)
         if measured:
             belief, draws = self.method.calibrate_belief(belief, sight.found, _WIDENING)

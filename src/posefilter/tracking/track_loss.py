@@ -34,7 +34,7 @@ class TrackLossDetector:
             trusted = self.sure
             status = LOST if not trusted else RECOVERED if self.ever_tracked else STARTED
         else:
-            trusted = presence > settings.lost_below
+            trusted = presence >= settings.lost_below
             self.doubts = 0 if trusted else self.doubts + 1
             status = LOST if self.doubts >= settings.patience else TRACKED
         self.lost = status == LOST
