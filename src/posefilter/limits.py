@@ -6,7 +6,7 @@ import struct
 import warnings
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import yaml
 from PIL import Image, UnidentifiedImageError
@@ -48,6 +48,13 @@ def read_bytes(path: Path, max_bytes: int = MOST_BYTES) -> bytes:
         return path.read_bytes()
     except OSError as error:
         raise BadData(path, "cannot be read", error.strerror or type(error).__name__) from error
+
+
+def _is_cut_off(data: bytes) -> bool:
+    """Tell whether a file is a TIFF whose table of contents lies beyond its end."""
+    order: Literal["little", "big"] = "little" if data.startswith(b"II") else "big"
+    tiff = data.startswith((b"II*\0", b"MM\0*"))
+    return tiff and int.from_bytes(data[4:8], order) >= len(data)
 
 
 def read_lines(path: Path, max_bytes: int = 1 << 22) -> list[str]:
@@ -147,14 +154,14 @@ def check_picture(path: Path, data: bytes) -> int:
     """
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore", Image.DecompressionBombWarning)
+            warnings.simplefilter("ignore")
             with Image.open(io.BytesIO(data)) as image:
                 width, height = image.size
     except Image.DecompressionBombError as error:
         raise BadData(path, "image too large", str(error)) from error
     except (UnidentifiedImageError, OSError, SyntaxError, ValueError, struct.error) as error:
         known = next((what for head, what in _OTHERS.items() if data.startswith(head)), None)
-        if known is not None:
+        if known is not None and not _is_cut_off(data):
             raise BadData(path, "is no image that can be read", known) from error
         raise BadData(path, "truncated or corrupt image", "its header cannot be read") from error
     if max(width, height) > MOST_SIDE or width * height > MOST_PIXELS:

@@ -19,9 +19,9 @@ feature `surface` at a fixed limit.
 
 Little of the object visible is harder than the probability shows, and a new frame's visibility is
 not known. A group that has enough calibration frames with less than a quarter visible therefore
-takes the largest of three limits: its own, that of these frames alone, and that of the others
-alone. Whichever kind the new frame is of, its set holds the truth with a probability of at least p
-(the idea of Barber et al. 2021, who take the largest over all large subsets; here over two).
+takes the larger of two limits, its own and that of these frames alone: the sets of such new frames
+hold the truth with a probability of at least p, and so do those of the others where these frames
+are no easier (after Barber et al. 2021, who take the largest limit over all large subsets).
 
 References:
     Vovk, Gammerman, Shafer: Algorithmic Learning in a Random World. Springer (2005).
@@ -32,7 +32,6 @@ References:
 
 import bisect
 import math
-from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal, get_args
@@ -85,16 +84,15 @@ class Conformal:
 
         Returns:
             The limit [nat]; infinite where the group's frames are too few for the level. Its
-            occluded frames, and its others, count by themselves where they are enough for it.
+            occluded frames count where they are enough for the level.
         """
         group = self.find_group(value)
         own, occluded = self.scores[group], self.occluded[group] if self.occluded else ()
         limit = _find_quantile(own, level)
         if len(occluded) < max(_FEWEST_OCCLUDED, _LEAST_OCCLUDED * len(own)):
             return limit
-        others = [*(Counter(own) - Counter(occluded)).elements()]
-        kinds = (_find_quantile(occluded, level), _find_quantile(others, level))
-        return max(limit, *(one for one in kinds if not math.isinf(one)))
+        second = _find_quantile(occluded, level)
+        return limit if math.isinf(second) else max(limit, second)
 
 
 def _find_quantile(scores: Sequence[float], level: float) -> float:

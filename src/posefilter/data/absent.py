@@ -1,6 +1,6 @@
 """Images of a dataset in which an object is not: where a filter must not find it."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 
 import torch
 
@@ -14,6 +14,7 @@ def find_absent(
     scenes: Mapping[str, Mapping[str, int]],
     split: str,
     name: str,
+    unlisted: Collection[tuple[str, str]] = (),
 ) -> list[FrameRecord]:
     """Return one record of each image in which an object is not listed.
 
@@ -26,6 +27,7 @@ def find_absent(
         scenes: The scenes of each split of the object's records, as `split_record` has them.
         split: Images are of its scenes, and of its part of those that no split has.
         name: The object's class.
+        unlisted: Images that show a class although no record says so, with the class.
     """
     elsewhere = {scene for part, found in scenes.items() if part != split for scene in found}
     elsewhere -= set(scenes[split])  # a part may stand for another one's scenes
@@ -36,6 +38,7 @@ def find_absent(
         elsewhere |= {*free} - {*free[held.index(split) :: 2]}
     showing = {record.name for record in own}
     showing |= {record.name for record in records if record.object == name}
+    showing |= {image for image, shown in unlisted if shown == name}
     found: dict[str, FrameRecord] = {}
     for record in records:
         if record.name not in showing and record.group not in elsewhere:

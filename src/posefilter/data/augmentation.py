@@ -14,7 +14,7 @@ import numpy as np
 from numpy.random import Generator
 
 from posefilter.data.frames import Sample
-from posefilter.errors import UserError
+from posefilter.errors import UserError, check_range
 
 Draw = Callable[[Generator], Sample]
 Augment = Callable[[Sample, Draw, Generator], Sample]
@@ -64,11 +64,8 @@ class RollAndZoom:
     def __post_init__(self) -> None:
         if self.pivot not in ("center", "object"):
             raise UserError(f"data.augment: pivot={self.pivot}: choose center or object")
-        if not 0 < self.object_size[0] <= self.object_size[1]:
-            raise UserError(
-                f"data.augment: object_size={list(self.object_size)}: expected two sizes above 0, "
-                "the smaller first"
-            )
+        check_range("data.augment: zoom", self.zoom, 0.0)
+        check_range("data.augment: object_size", self.object_size, 0.0)
 
     def __call__(self, sample: Sample, draw: Draw, rng: Generator) -> Sample:
         """Return the sample as the turned and zoomed camera sees it."""
@@ -185,6 +182,9 @@ class PasteOccluder:
     size: tuple[float, float] = (0.04, 0.18)
     keep: float = 0.25
 
+    def __post_init__(self) -> None:
+        check_range("data.augment: size", self.size, 0.0)
+
     def __call__(self, sample: Sample, draw: Draw, rng: Generator) -> Sample:
         """Return the sample with the occluder's color and depth pasted in and the mask cut."""
         if rng.random() >= self.probability or not sample.mask.any():
@@ -223,6 +223,11 @@ class RandomErasing:
 
     max_rectangles: int = 5
     size: tuple[float, float] = (0.02, 0.18)
+
+    def __post_init__(self) -> None:
+        check_range("data.augment: size", self.size, 0.0)
+        if self.max_rectangles < 0:
+            raise UserError(f"data.augment: max_rectangles={self.max_rectangles}: is below 0")
 
     def __call__(self, sample: Sample, draw: Draw, rng: Generator) -> Sample:
         """Return the sample with up to `max_rectangles` rectangles blanked."""

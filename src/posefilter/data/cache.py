@@ -85,7 +85,7 @@ class DiskCache:
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
             (self.folder / "README").write_text(
-                f"decoded frames; may be deleted at any time\n{version}\n"
+                f"decoded frames; may be deleted while no run uses them\n{version}\n"
             )
             remove_parts(self.folder, ["*"], _STALE)
         except OSError as error:
@@ -141,6 +141,8 @@ class DiskCache:
         if one is None:
             raise UserError(f"{record.files[0]}: changed while it was in use; start again")
         path, (height, width) = self._images[record.key], one.shape
+        if not path.is_file():
+            raise UserError(f"{path}: was deleted while it was in use; start again")
         if path.stat().st_size > 5 * height * width + _HEADER:
             raise self._damaged(path)
         try:

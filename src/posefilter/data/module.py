@@ -21,7 +21,7 @@ from posefilter.data.generated_scenes import ensure_scenes
 from posefilter.data.loaders import count_batches, make_loader, spare_cores
 from posefilter.data.points import read_model_points
 from posefilter.data.readers.base import BaseReader
-from posefilter.data.readers.registry import open_meshes, open_reader
+from posefilter.data.readers.registry import open_meshes, open_reader, open_whole
 from posefilter.data.splits import NAMES, Share, split_records
 from posefilter.errors import UserError
 from posefilter.meshes.store import BUILTIN, MeshStore, object_model
@@ -295,9 +295,9 @@ class PoseDataModule(LightningDataModule):
         An image counts where the dataset does not list the object in it, and where its scene is of
         no other split.
         """
-        reader = open_reader(self.source, self.root, None, None, "skip", **self._options)
-        records = reader.records()
         name = self._object if isinstance(self._object, str) else self.objects[0]
+        reader = open_whole(self.source, self.root, [name], None, "skip", **self._options)
+        records = reader.records()
         try:
             own = self._records
         except UserError:
@@ -305,7 +305,8 @@ class PoseDataModule(LightningDataModule):
                 raise
             own = []  # no image of this dataset shows it
         scenes = self.split_record() if own else {part: {} for part in NAMES}
-        found = find_absent(records, own, scenes, split, name)
+        unlisted = getattr(reader, "unlisted", ())  # a plug-in's may have none
+        found = find_absent(records, own, scenes, split, name, unlisted)
         if found and annotates_one_class(records):
             log.warning(
                 "%s: each image annotates one class; images that do not annotate %s may show it "
@@ -410,7 +411,10 @@ class PoseDataModule(LightningDataModule):
         """Warn where so many images will hardly fit into the memory that is free."""
         width = self._image_width or _USUAL_WIDTH
         needed = images * _IMAGE_BYTES * 0.75 * width * width
-        free = os.sysconf("SC_AVPHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+        try:
+            free = os.sysconf("SC_AVPHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+        except (AttributeError, ValueError, OSError):  # Windows, macOS: not known
+            return
         if needed > 0.7 * free:
             log.warning(
                 "data.cache=memory: %d images take some %.0f GB, and %.0f GB of memory are free; "

@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from posefilter.data.augmentation import Draw, draw_rectangle
 from posefilter.data.frames import Sample
-from posefilter.errors import UserError
+from posefilter.errors import UserError, check_range
 from posefilter.synthetic.sensor import motion_kernel
 
 
@@ -41,6 +41,7 @@ class ColorResponse:
     def __post_init__(self) -> None:
         if self.target not in ("image", "object"):
             raise UserError(f"augment: target={self.target}: choose image or object")
+        check_range("data.augment: gain", self.gain, 0.0)
 
     def __call__(self, sample: Sample, draw: Draw, rng: Generator) -> Sample:
         """Return the sample with another color response."""
@@ -117,6 +118,9 @@ class Jpeg:
     quality: tuple[int, int] = (40, 95)  # range; 100 is best
     probability: float = 0.3
 
+    def __post_init__(self) -> None:
+        check_range("data.augment: quality", self.quality, 0.0)
+
     def __call__(self, sample: Sample, draw: Draw, rng: Generator) -> Sample:
         """Return the sample, compressed or not."""
         chosen = rng.random() < self.probability
@@ -139,6 +143,9 @@ class Sticker:
     size: tuple[float, float] = (0.15, 0.5)  # of its sides, in roots of the object's visible area
     white: float = 0.7  # share of labels that are nearly white; the others have any color
     printed: float = 0.5  # share of labels with dark bars
+
+    def __post_init__(self) -> None:
+        check_range("data.augment: size", self.size, 0.0)
 
     def __call__(self, sample: Sample, draw: Draw, rng: Generator) -> Sample:
         """Return the sample with or without a label."""

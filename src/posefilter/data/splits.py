@@ -52,6 +52,12 @@ def split_records(
     out: dict[str, list[int]] = {name: [] for name in NAMES}
     taken: dict[str, str] = {}  # scene -> split
     for name, share in split.items():
+        if isinstance(share, bool) or (isinstance(share, Sequence) and not len(share)):
+            raise UserError(
+                f"data.split.{name}={share}: a share from 0 to 1, scenes, a file of them, "
+                "or another part"
+            )
+    for name, share in split.items():
         if share is None or isinstance(share, int | float) or share in NAMES:
             continue
         chosen = (
@@ -160,7 +166,7 @@ def _divide_images(
 def _divide(scenes: list[str], fractions: Mapping[str, float], seed: int) -> dict[str, str]:
     """Return the split of each scene: every fraction gets one scene at least."""
     order = [scenes[i] for i in np.random.default_rng([seed, 7]).permutation(len(scenes))]
-    return _deal(order, fractions, NAMES[::-1])  # more scenes later leave test alone for longest
+    return _deal(order, fractions, NAMES[::-1])
 
 
 def _deal(

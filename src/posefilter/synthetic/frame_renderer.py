@@ -178,7 +178,12 @@ class FrameRenderer:
         for layout, _ in self._draw_layouts(scene, rng):
             for _ in range(8):
                 found = draw_scenario(
-                    layout, self.job.motion, self.job.frames_per_scene, scene.textures[1], rng
+                    layout,
+                    self.job.motion,
+                    self.job.frames_per_scene,
+                    scene.textures[1],
+                    rng,
+                    self.job.cameras()[-1][1],
                 )
                 if is_possible(found, view, self.job.scenes.largest_truncation):
                     return found

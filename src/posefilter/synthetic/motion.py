@@ -58,6 +58,7 @@ class Scenario:
     cover: Plane | None  # its texture and tile; where it stands follows from the frame
     covered: range  # the frames that it covers the target in
     side: np.ndarray  # (2,) unit, from where it comes, in the image's axes
+    baseline: float = 0.0  # to a second camera, that it hides the target from, too [m]
 
     def at(self, frame: int) -> Layout:
         """Return the layout of a frame."""
@@ -78,6 +79,7 @@ class Scenario:
         distance = float(np.linalg.norm(target.center))
         radius = min(target.solid.radius, 0.9 * distance)
         half = _MARGIN * _DEPTH * distance * math.tan(math.asin(radius / distance))
+        half += self.baseline * (1 - _DEPTH)  # so far it is beside the object from the second
         towards = target.center / distance
         right = np.cross([0.0, 1.0, 0.0], towards)
         right /= np.linalg.norm(right)
@@ -94,6 +96,7 @@ def draw_scenario(
     frames: int,
     texture: np.ndarray,
     rng: np.random.Generator,
+    baseline: float = 0.0,
 ) -> Scenario:
     """Draw paths, and a cover.
 
@@ -105,6 +108,7 @@ def draw_scenario(
         frames: Frames of the scene, T.
         texture: Of the cover, (h, w, 3) uint8.
         rng: Source of randomness.
+        baseline: Distance to the right one of two cameras [m].
     """
     still = np.zeros((frames, 6))
     steps = settings.translation_mm, settings.rotation_deg
@@ -123,6 +127,7 @@ def draw_scenario(
         cover if settings.fully_occluded_frames else None,
         range(start, start + settings.fully_occluded_frames),
         np.array([math.cos(angle), math.sin(angle)]),
+        baseline,
     )
 
 

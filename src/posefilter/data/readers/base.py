@@ -33,6 +33,8 @@ class BaseReader:
         self.skipped: Counter[str] = Counter()  # what listing left out: reasons and counts
         self.examples: dict[str, str] = {}  # of each reason to skip, the first message
         self.notes: Counter[str] = Counter()  # what else the log should say, with counts
+        # image and class of what listing left out although the image shows it
+        self.unlisted: set[tuple[str, str]] = set()
         self._geometry = None if meshes is None else Geometry(meshes)
 
     def records(self) -> Sequence[FrameRecord]:

@@ -239,6 +239,7 @@ class FatReader(BaseReader):
             if len(many) > 1 and (self._geometry is None or self._geometry.mesh(name) is None):
                 why = "two instances of one class, and no mesh that fits to tell them apart"
                 self.skipped[why] += len(many)
+                self.unlisted.add((image, name))
                 continue
             if len(many) > 1:
                 self.notes["masks split between instances of one class by geometry"] += len(many)

@@ -95,7 +95,7 @@ def open_whole(
     source: str,
     root: str | Path,
     names: Sequence[str],
-    meshes: MeshStore,
+    meshes: MeshStore | None,
     on_error: str = "raise",
     **options: Any,
 ) -> BaseReader:
