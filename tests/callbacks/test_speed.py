@@ -35,6 +35,7 @@ def test_images_waiting_and_validations_are_timed_separately(
         now[0] += wait
         callback.on_train_batch_start(trainer, method, batch, 0)
         now[0] += 3.0
+        trainer.global_step += 1
         callback.on_train_batch_end(trainer, method, None, batch, 0)
 
     step(100.0)  # the first wait, for workers to start, is nobody's

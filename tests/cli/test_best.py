@@ -272,6 +272,8 @@ EVERY_SECOND = {"check_val_every_n_epoch": 2, "val_check_interval": 1.0}
         ({"limit_val_batches": 0}, "trainer.limit_val_batches=0: "),
         ({"limit_train_batches": 0.0}, "trainer.limit_train_batches=0: "),
         ({"limit_test_batches": 0}, "trainer.limit_test_batches=0: "),
+        ({"limit_test_batches": 0.2}, "trainer.limit_test_batches=0.2: of 3 batches this is none"),
+        ({"limit_test_batches": 0.4, "max_epochs": 3}, None),
         ({"max_epochs": 2}, "trainer.max_epochs=2: 8 batches, and the first validation is"),
         ({"max_epochs": 3}, None),
         ({"max_epochs": 3, "limit_train_batches": 2}, "trainer.max_epochs=3: 6 batches"),
@@ -290,7 +292,7 @@ def test_a_training_without_a_validation_is_refused_before_it_begins(
         ("limit_train_batches", "limit_val_batches", "limit_test_batches"), 1.0
     )
     trainer = SimpleNamespace(**{**settings, **changed})
-    data = SimpleNamespace(train_dataloader=lambda: range(4))
+    data = SimpleNamespace(train_dataloader=lambda: range(4), test_dataloader=lambda: range(3))
     run: Any = SimpleNamespace(trainer=trainer, data=data)
     if told is None:
         check_validated(run)

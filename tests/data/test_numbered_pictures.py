@@ -146,7 +146,9 @@ def test_a_distortion_that_no_lens_has_is_named(tmp_path: Path) -> None:
     write_frames(tmp_path, [(24, 32)])
     K = np.array([[32.0, 0, 16], [0, 32, 12], [0, 0, 1]])
     assert FolderVideo(tmp_path, K, 1000.0, distortion=(0.1, 0, 0, 0)).read(0).depth.any()
-    with pytest.raises(UserError, match=r"^frame .*: distortion=50,0,0,0: without it, .* % of the depth is"):
+    with pytest.raises(
+        UserError, match=r"^frame .*: distortion=50,0,0,0: without it, .* % of the depth is"
+    ):
         FolderVideo(tmp_path, K, 1000.0, distortion=(50, 0, 0, 0)).read(0)
 
 

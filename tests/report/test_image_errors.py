@@ -150,6 +150,15 @@ def test_images_are_matched_by_name_not_by_index(pair: tuple[Path, Path]) -> Non
     assert verdict.chance == pytest.approx(2 / 2**35)
 
 
+def test_images_of_one_name_that_show_other_things_are_no_pair() -> None:
+    """Rendered sets name their images alike."""
+    row = make_row(0, 3.0)
+    assert match_images([row], [row._replace(visibility=0.95)])  # of another resolution
+    assert match_images([row], [row._replace(visibility=math.nan)])
+    assert not match_images([row], [row._replace(visibility=0.8)])
+    assert not match_images([row], [row._replace(diameter_mm=210.0)])
+
+
 def test_instances_of_an_image_are_paired_in_their_order() -> None:
     two = [make_row(0, 3.0), make_row(0, 50.0)]
     assert [(pair.a.add_mm, pair.b.add_mm) for pair in match_images(two, two)] == [

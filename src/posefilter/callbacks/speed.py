@@ -19,10 +19,14 @@ class Speed(Callback):
     """
 
     def __init__(self) -> None:
-        self._images = self._steps = self._seen = 0
+        self._images = self._steps = self._seen = self._first = 0
         self._waited = self._worked = 0.0
         self._mark: float | None = None  # when the last batch ended
         self._began = 0.0  # the batch, or the validation
+
+    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Count from the step that a resumed training begins at."""
+        self._first = trainer.global_step
 
     def on_train_batch_start(self, *_: Any) -> None:
         """Count the time since the last batch as waiting."""
@@ -37,10 +41,10 @@ class Speed(Callback):
         self._mark = time.perf_counter()
         self._worked += self._mark - self._began
         self._images += len(batch[0])
-        self._steps += 1
+        self._steps = trainer.global_step - self._first
         if self._steps >= trainer.log_every_n_steps:  # type: ignore[attr-defined]  # the logger connector sets it
             self.write_down(trainer, self.training() | measure_memory(pl_module.device))
-            self._images = self._steps = 0
+            self._images, self._first = 0, trainer.global_step
             self._waited = self._worked = 0.0
 
     def training(self) -> dict[str, float]:

@@ -112,9 +112,10 @@ def build_trainer(job: Job) -> Trainer:
     cfg.folder = str(job.folder)
     _check_trainer(cfg.trainer)
     steps, interval = cfg.trainer.get("max_steps", -1), cfg.trainer.get("val_check_interval")
+    steps *= cfg.trainer.get("accumulate_grad_batches", 1)  # the interval is of batches
     # else it would never be validated, and have no best checkpoint
     if isinstance(interval, int) and 0 < steps < interval:
-        said = "trainer.val_check_interval=%d is more than max_steps=%d: validated at the end"
+        said = "trainer.val_check_interval=%d is more than the %d batches: validated at the end"
         log.info(said, interval, steps)
         cfg.trainer.val_check_interval = steps
     callbacks: list[Callback] = _build_all(cfg.callbacks, "callbacks", Callback)
@@ -148,7 +149,7 @@ def _check_trainer(node: DictConfig) -> None:
     if isinstance(interval, float) and node.get("check_val_every_n_epoch") is None:
         raise UserError(
             f"trainer.val_check_interval={interval}: a share of an epoch needs "
-            "trainer.check_val_every_n_epoch=1; a whole number is of steps"
+            "trainer.check_val_every_n_epoch=1; a whole number is of batches"
         )
     for name in ("fast_dev_run", "barebones"):
         if node.get(name):

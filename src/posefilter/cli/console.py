@@ -94,8 +94,12 @@ def typed_prediction(checkpoint: Path) -> str:
 
 
 def name_program(command: str) -> str:
-    """Return a command as it is typed here."""
-    return f"posefilter {command}" if is_installed() else f"python {command}.py"
+    """Return a command as it is typed here: a script's path, where another one was typed so."""
+    if is_installed():
+        return f"posefilter {command}"
+    beside = Path(sys.argv[0]).with_name(f"{command}.py")
+    script = beside if beside.parent != Path() and beside.is_file() else beside.name
+    return f"python {shlex.quote(str(script))}"
 
 
 def is_installed() -> bool:

@@ -120,7 +120,8 @@ def read_results(job: Job) -> dict[str, Any]:
 
 def deciding(overrides: list[str]) -> list[str]:
     """Return what was typed, in one order, less what says where and with how many hands."""
-    return sorted(typed for typed in overrides if key_of(typed) not in HANDS)
+    silent = (*HANDS, "resume", "plugins")
+    return sorted(typed for typed in overrides if key_of(typed) not in silent)
 
 
 # what an evaluation writes, the file by which it is known last; and where what a run's own test has

@@ -18,7 +18,7 @@ from posefilter.cli.best import check_kept
 from posefilter.cli.build import build_data, build_trainer
 from posefilter.cli.checkpoints import build_method, method_of, read_checkpoint, recipe
 from posefilter.cli.console import is_installed, say, typed
-from posefilter.cli.folders import move_evaluation
+from posefilter.cli.folders import move_evaluation, own_metrics
 from posefilter.cli.job import Job
 from posefilter.cli.learned import DATA, list_learned
 from posefilter.cli.machine import settle
@@ -153,6 +153,7 @@ def fit(run: Run) -> dict[str, Any]:
     check_kept(run.trainer.callbacks, run.job.folder)  # type: ignore[attr-defined]
     check_validated(run)
     start, before = start_from(run.job)
+    known = own_metrics(run.job.folder).get("training") or {}
     moved = None if is_follower() else move_evaluation(run.job.folder)
     if moved is not None:
         sentence = f"the evaluation that was here, of an earlier checkpoint, is now in {moved}"
@@ -175,6 +176,8 @@ def fit(run: Run) -> dict[str, Any]:
             raise
         raise UserError(f"trainer or callbacks: {told}") from error
     taken = cost(run.trainer.global_step, before, *began)
+    if run.trainer.global_step == before:  # resumed at its end: what was measured stays
+        taken |= {k: v for k, v in known.items() if k in taken and taken[k] is None}
     return {**taken, "learned_from": learned_from(run.job)}
 
 
@@ -195,6 +198,13 @@ def check_validated(run: Run) -> None:
     for name, what in needed.items():
         if getattr(trainer, name) == 0:
             raise UserError(f"trainer.{name}=0: a training needs {what}")
+    share = trainer.limit_test_batches
+    few = isinstance(share, float) and share < 1
+    if few and int(share * (tested := len(run.data.test_dataloader()))) < 1:
+        raise UserError(
+            f"trainer.limit_test_batches={share}: of {tested} batches this is none, and a training "
+            "ends with its test"
+        )
     batches = count_batches(len(run.data.train_dataloader()), trainer.limit_train_batches)
     _check_epochs(trainer, batches)
     if every is None or trainer.max_steps < 0:

@@ -90,6 +90,9 @@ def read_two_runs(text: str) -> tuple[Run, Run]:
 def match_images(a: Sequence[ImageError], b: Sequence[ImageError]) -> list[Pair]:
     """Return the images that two tests share, by dataset name and ids, in the first one's order.
 
+    Rendered sets name their images alike: an object of another diameter, or of which another share
+    is visible, is in another image.
+
     Of several instances in an image the first are a pair, the second, and so on: a dataset always
     lists them in the same order. Where the tests have not as many of them, none is a pair.
     """
@@ -99,7 +102,16 @@ def match_images(a: Sequence[ImageError], b: Sequence[ImageError]) -> list[Pair]
         for key, rows in own.items()
         if len(rows) == len(others.get(key, ()))
         for both in zip(rows, others[key], strict=True)
+        if _shows_the_same(*both)
     ]
+
+
+def _shows_the_same(a: ImageError, b: ImageError) -> bool:
+    """Tell whether two rows of one name may be of one image, as far as both say."""
+    alike = math.isclose(a.diameter_mm, b.diameter_mm, rel_tol=1e-3)
+    known = not math.isnan(a.visibility) and not math.isnan(b.visibility)
+    # of another resolution of the same image it may differ a little
+    return alike and not (known and abs(a.visibility - b.visibility) > 0.1)
 
 
 def _group_by_identity(rows: Sequence[ImageError]) -> dict[tuple[Any, ...], list[ImageError]]:

@@ -82,7 +82,9 @@ def head_lines(run: Run) -> list[Paragraph]:
     else:
         badge, state = Text("not tested yet", "badge"), "nothing logged yet"
         if train:
-            state = f"at step {train.steps[-1] + 1}" + (f" of {most}" if most and most > 0 else "")
+            state = f"at step {train.steps[-1] + 1}" + (
+                f" of {most}" if isinstance(most, int) and most > 0 else ""
+            )
         state += f"; numbers of the validation at step {step}" if step is not None else ""
     chosen = (run.config.get("data") or {}).get("object") or ""
     objects = ", ".join(run.data.get("objects") or []) or str(chosen)
