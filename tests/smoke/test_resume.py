@@ -220,6 +220,8 @@ def test_a_run_that_cannot_go_on_with_what_is_typed_keeps_its_settings(
         ("seed=1", "seed=1: the run began with another"),
         ("data.split={test: 1.0}", "data.split={test: 1.0}: the run began with another"),
         ("model=patch_pf", "model=patch_pf: the run began with another"),
+        ("loss=add", "loss=add: the run began with another"),
+        ("data.batch_size=3", "data.batch_size=3: the run began with another"),
         ("warm_start=all", "warm_start=all: the run began with another"),
         ("out=elsewhere", "a run that is resumed stays in its folder"),
         ("model.net.width=8", "holds other networks than these settings"),

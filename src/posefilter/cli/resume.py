@@ -19,8 +19,13 @@ from posefilter.paths import check_links, stays_inside
 LAST, BEFORE = "last.ckpt", "last.previous.ckpt"  # of a run's checkpoints
 _DROPPED = ("resume", "out", "hydra.run.dir", "plugins")
 # by whose change a run would be another, or that a checkpoint brings with it: groups and settings
-_KEPT_GROUPS = ("model", "variant", "preset", "data", "optimizer", "experiment", "ablation")
-_KEPT = ("seed", "warm_start", "data.split", "data.split_seed", "data.object", "optimizer")
+_KEPT_GROUPS = (
+    "model", "variant", "preset", "data", "loss", "optimizer", "scheduler", "experiment", "ablation"
+)  # fmt: skip
+_KEPT = (
+    "seed", "warm_start", "data.split", "data.split_seed", "data.object", "data.batch_size", "loss",
+    "optimizer", "scheduler",
+)  # fmt: skip
 _OVERRIDE = re.compile(r"([+~]{0,2})([A-Za-z_][\w./@]*)(?:=(.*))?", re.DOTALL)
 # that a run writes to
 _PLACES = ("cache_dir", "default_root_dir", "dirpath", "folder", "log_dir", "root_dir", "save_dir")
