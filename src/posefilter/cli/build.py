@@ -112,7 +112,8 @@ def build_trainer(job: Job) -> Trainer:
     cfg.folder = str(job.folder)
     _check_trainer(cfg.trainer)
     steps, interval = cfg.trainer.get("max_steps", -1), cfg.trainer.get("val_check_interval")
-    steps *= cfg.trainer.get("accumulate_grad_batches", 1)  # the interval is of batches
+    accumulated = cfg.trainer.get("accumulate_grad_batches", 1)
+    steps *= accumulated if isinstance(accumulated, int) else 1  # the interval is of batches
     # else it would never be validated, and have no best checkpoint
     if isinstance(interval, int) and 0 < steps < interval:
         said = "trainer.val_check_interval=%d is more than the %d batches: validated at the end"
