@@ -2,16 +2,17 @@
 
 from collections.abc import Callable
 from functools import wraps
-from typing import Any, TypeVar
+from typing import ParamSpec, TypeVar
 
 import torch
 
 from posefilter.errors import UserError
 
-_F = TypeVar("_F", bound=Callable[..., Any])
+_P = ParamSpec("_P")
+_R = TypeVar("_R")
 
 
-def in_float32(function: _F) -> _F:
+def in_float32(function: Callable[_P, _R]) -> Callable[_P, _R]:
     """Return a function that computes in float32 wherever it is called, or in what it says itself:
     a caller's autocast would put geometry into half precision.
 
@@ -21,7 +22,7 @@ def in_float32(function: _F) -> _F:
     """
 
     @wraps(function)
-    def checked(*args: Any, **kwargs: Any) -> Any:
+    def checked(*args: _P.args, **kwargs: _P.kwargs) -> _R:
         if torch.get_default_dtype() != torch.float32:
             raise UserError(
                 f"torch.set_default_dtype({torch.get_default_dtype()}): posefilter needs "
@@ -30,4 +31,4 @@ def in_float32(function: _F) -> _F:
         with torch.autocast("cpu", enabled=False), torch.autocast("cuda", enabled=False):
             return function(*args, **kwargs)
 
-    return checked  # type: ignore[return-value]
+    return checked

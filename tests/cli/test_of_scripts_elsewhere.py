@@ -1,4 +1,4 @@
-"""What a later start is told: of a script in another folder, and of a job resumed by itself."""
+"""Scripts that are run from another folder, and jobs of a sweep that are resumed by themselves."""
 
 from pathlib import Path
 

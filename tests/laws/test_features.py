@@ -4,9 +4,11 @@ import math
 from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 
+from posefilter.confidence.calibration import LIMIT, standardize
 from posefilter.confidence.features import (
     measure_belief,
     measure_coordinates,
@@ -128,3 +130,9 @@ def test_particles_at_equivalent_poses_agree() -> None:
     # a continuous symmetry is known by a few of its turns
     any_turn = measure(round_, half @ between)["concentration_up_to_symmetry"]
     assert float(any_turn) >= float(alone)
+
+
+def test_what_is_no_number_speaks_against_an_estimate_as_far_as_any_can() -> None:
+    features = np.array([[np.inf, -np.inf, np.nan, 1.0]])
+    standardized = standardize(features, (0.0,) * 4, (1.0,) * 4)
+    assert standardized.tolist() == [[-LIMIT, -LIMIT, -LIMIT, 1.0]]

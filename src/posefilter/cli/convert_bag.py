@@ -48,7 +48,8 @@ def convert_bag(job: Job) -> None:
         tally = Tally(dict.fromkeys(estimator.objects, 0))
         watch = bars(shown=cfg.console != JSON, transient=True)
         with BagWriter(out, str(cfg.detections)) as writer, watch as bar:
-            task, copying = bar.add_task("images", total=reader.images), False
+            task = bar.add_task("images", total=reader.images)
+            copying = False
             if cfg.copy_messages:
                 writer.add_connections(reader.reader.connections)  # first: it may be refused
             try:

@@ -20,7 +20,7 @@ from posefilter.errors import Carrier, UserError
 from posefilter.files import remove_parts, write_whole
 from posefilter.limits import read_json
 from posefilter.locks import hold
-from posefilter.report.settings import HANDS
+from posefilter.report.settings import SILENT
 
 FAILED = "failed.json"  # in the folder of a sweep's job
 OUTPUTS = "outputs"  # where commands write unless told otherwise
@@ -120,8 +120,7 @@ def read_results(job: Job) -> dict[str, Any]:
 
 def deciding(overrides: list[str]) -> list[str]:
     """Return what was typed, in one order, less what says where and with how many hands."""
-    silent = (*HANDS, "resume", "plugins")
-    return sorted(typed for typed in overrides if key_of(typed) not in silent)
+    return sorted(typed for typed in overrides if key_of(typed) not in SILENT)
 
 
 # what an evaluation writes, the file by which it is known last; and where what a run's own test has

@@ -23,7 +23,7 @@ from posefilter.cli.shapes import load_shape, open_shapes
 from posefilter.cli.track_log import POSES, TrackLog, check_unused
 from posefilter.data.readers.registry import open_meshes, open_whole
 from posefilter.data.sequences import FolderVideo, Scene, SceneVideo, Video, VideoFrame, list_scenes
-from posefilter.errors import Stopped, UserError
+from posefilter.errors import Stopped, UserError, naming
 from posefilter.estimator import Estimator
 from posefilter.figures.detections import Drawn, draw_detections
 from posefilter.figures.overlay import Shape
@@ -192,10 +192,8 @@ def read_frame(video: Video, index: int, tracker: Tracker) -> VideoFrame | None:
     """
     frame = video.read(index)
     if frame is not None:
-        try:
+        with naming(f"frame {frame.name}"):
             tracker.check(frame.rgb, frame.depth, frame.intrinsics)
-        except UserError as error:
-            raise UserError(f"frame {frame.name}: {error}") from error
     return frame
 
 

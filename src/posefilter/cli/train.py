@@ -200,7 +200,7 @@ def check_validated(run: Run) -> None:
             raise UserError(f"trainer.{name}=0: a training needs {what}")
     share = trainer.limit_test_batches
     few = isinstance(share, float) and share < 1
-    if few and int(share * (tested := len(run.data.test_dataloader()))) < 1:
+    if few and not count_batches(tested := len(run.data.test_dataloader()), share):
         raise UserError(
             f"trainer.limit_test_batches={share}: of {tested} batches this is none, and a training "
             "ends with its test"

@@ -206,9 +206,8 @@ def _evaluate(one: Logistic, x: Tensor) -> Tensor:
 
 def standardize(x: np.ndarray, center: Sequence[float], scale: Sequence[float]) -> np.ndarray:
     """Return features (n, F) as the regressions take them."""
-    x = np.where(np.isfinite(x), x, np.nan)
     x = (x - np.array(center)) / np.array(scale)
-    return np.nan_to_num(x, nan=-LIMIT).clip(-LIMIT, LIMIT)
+    return np.nan_to_num(x, nan=-LIMIT, posinf=-LIMIT).clip(-LIMIT, LIMIT)
 
 
 def tabulate_errors(features: np.ndarray, errors: np.ndarray) -> CalibrationErrors:

@@ -141,9 +141,11 @@ class DiskCache:
         if one is None:
             raise UserError(f"{record.files[0]}: changed while it was in use; start again")
         path, (height, width) = self._images[record.key], one.shape
-        if not path.is_file():
-            raise UserError(f"{path}: was deleted while it was in use; start again")
-        if path.stat().st_size > 5 * height * width + _HEADER:
+        try:
+            size = path.stat().st_size
+        except FileNotFoundError as error:
+            raise UserError(f"{path}: was deleted while it was in use; start again") from error
+        if size > 5 * height * width + _HEADER:
             raise self._damaged(path)
         try:
             return unpack(np.load(path), one, frame_id)

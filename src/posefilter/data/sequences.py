@@ -22,7 +22,7 @@ from posefilter.data.readers.decode import (
     read_depth,
     read_size,
 )
-from posefilter.errors import BadData, UserError
+from posefilter.errors import BadData, UserError, naming
 from posefilter.geometry.lens import undistort_most
 
 _ASKED = 50  # color pictures, whose commonest size is the video's where no camera's file says one
@@ -155,10 +155,8 @@ class FolderVideo(Video):
             self._size, self._sized = self._find_size()
         expect_size(color, rgb, *self._size, self._sized)
         if self._distortion is not None:
-            try:
+            with naming(f"frame {color.stem}"):
                 rgb, z = undistort_most(rgb, z, self._K, self._distortion)
-            except UserError as error:
-                raise UserError(f"frame {color.stem}: {error}") from error
         return VideoFrame(color.stem, number, rgb, z, self._K, {})
 
     def _find_size(self) -> tuple[tuple[int, int], str]:

@@ -17,9 +17,8 @@ from posefilter.limits import open_text
 from posefilter.metrics.results import score_numbers
 from posefilter.report.diagnostics import list_numbers
 from posefilter.report.gather import SWEEP_MARKS, read_json, read_part, read_texts, read_yaml
-from posefilter.report.settings import HANDS, read_typed
+from posefilter.report.settings import SILENT, read_typed
 
-SILENT = (*HANDS, "resume", "plugins")  # unless they are swept
 COLUMNS = {  # of summary.csv, and the metrics that they hold
     key.replace("/", "_"): key
     for key in (
