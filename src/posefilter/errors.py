@@ -43,7 +43,7 @@ def check_positive(key: str, value: Any) -> None:
     """Raise UserError, naming the key, unless a setting is a number above 0."""
     number = isinstance(value, Real) and not isinstance(value, bool)
     if not (number and 0 < value < math.inf):
-        raise UserError(f"{key}={value}: must be a positive number")
+        raise UserError(f"{key}={value!r}: must be a positive number")
 
 
 def check_range(key: str, value: Sequence[float], least: float = -math.inf) -> tuple[float, float]:

@@ -186,7 +186,8 @@ def _check_color(color: np.ndarray) -> np.ndarray:
         raise UserError("rgb: holds NaN or infinity")
     if not (color.min() >= 0 and color.max() <= 1):
         raise UserError(
-            f"rgb: floats should lie in [0, 1], not in [{color.min():.3g}, {color.max():.3g}]"
+            f"rgb: floats should lie in [0, 1], not in [{color.min():.6g}, {color.max():.6g}]; "
+            "numpy.clip(rgb, 0, 1) cuts off what interpolation has added"
         )
     return np.ascontiguousarray(color, dtype=np.float32)
 
@@ -259,9 +260,10 @@ def check_intrinsics(K: np.ndarray, count: int, size: tuple[int, int] | None = N
     """
     if K.shape not in ((3, 3), (count, 3, 3)) or K.dtype.kind not in "fiu":
         instead = f": {_INSTEAD[K.shape]}" if K.shape in _INSTEAD else ""
+        each = f", or one for each image ({count}, 3, 3)" if count > 1 else ""
         raise UserError(
             f"intrinsics: has shape {K.shape} and type {K.dtype}; "
-            f"expected a camera matrix (3, 3) [px]{instead}"
+            f"expected a camera matrix (3, 3) [px]{each}{instead}"
         )
     K = np.array(np.broadcast_to(K, (count, 3, 3)), dtype=np.float64)
     if not np.isfinite(K).all():

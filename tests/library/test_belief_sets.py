@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+import re
 from pathlib import Path
 
 import numpy as np
@@ -57,6 +58,9 @@ def test_credible_sets_hold_their_share_of_what_the_belief_was_drawn_from() -> N
         assert one.coverage == one.level == level
         assert one.min_log_density == one.least
         again = belief.highest_density_region(one.coverage, one.min_log_density)
+        for wrong in ((90, 3.0), (0.9, "3"), (0.9, float("nan"))):
+            with pytest.raises(UserError, match=r"coverage is between|threshold .* is no number"):
+                belief.highest_density_region(*wrong)
         assert np.array_equal(again.samples, one.samples)
     assert not belief.credible_set(0.999).contains(move_far(middle().numpy()))
     assert belief.credible_set(1.0).weights.sum() == pytest.approx(1)
@@ -224,6 +228,14 @@ def test_a_file_is_found_by_the_name_that_it_was_saved_by(tmp_path: Path) -> Non
     with pytest.raises(UserError, match=r"folder: is a folder; name the file to write$"):
         belief.save(tmp_path / "folder")
     assert not (tmp_path / "folder.npz").exists()
+    with pytest.raises(UserError, match=r"folder: is a folder; name the file to read$"):
+        Belief.load(tmp_path / "folder")
+    for use in (belief.save, Belief.load):
+        with pytest.raises(UserError, match=r"^None: expected the path of a belief's file$"):
+            use(None)  # type: ignore[operator]
+    with np.load(tmp_path / "belief.npz") as stored:
+        named = set(re.findall(r"`(\w+)`", Belief.save.__doc__.split("arrays are")[1]))  # type: ignore[union-attr]
+        assert set(stored.files) == named
     assert (tmp_path / "belief.npz").is_file()
     for name in ("belief", "belief.npz"):
         assert Belief.load(tmp_path / name).object == "duck"

@@ -343,6 +343,7 @@ def test_pictures_take_the_images_that_predict_takes(small: posefilter.Estimator
         ({"depth": np.zeros((240, 320))}, "no pixel has depth"),
         ({"rgb": np.ones((240, 320))}, "rgb: has shape"),
         ({"rgb": np.full((240, 320, 3), 255.0)}, "rgb: floats should lie in"),
+        ({"rgb": np.full((240, 320, 3), 1.002)}, r"not in \[1.002, 1.002\]; numpy.clip"),
         ({"rgb": np.ones((240, 320, 3), np.int64)}, "expected uint8"),
         ({"intrinsics": np.ones(4)}, r"camera matrix .*: of fx, fy, cx, cy give \[\["),
         ({"intrinsics": np.ones((3, 4))}, r"of a projection matrix P .* give P\[:, :3\]"),

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
-from numbers import Integral
+from numbers import Integral, Real
 from pathlib import Path
 from typing import Any
 
@@ -289,7 +289,13 @@ class Belief:
         Args:
             coverage: What the set is made for, which it states and does not compute.
             min_log_density: The threshold [nat]; minus infinity gives the set of all poses.
+
+        Raises:
+            UserError: The coverage is not between 0 and 1, or the threshold no number.
         """
+        check_probability("coverage", coverage)
+        if not isinstance(min_log_density, Real | np.generic) or np.isnan(min_log_density):
+            raise UserError(f"belief: the threshold {min_log_density!r} is no number")
         inside = self._held_out >= min_log_density
         samples = self.samples[self._density.chosen.numpy()[inside]]
         weights = self._density.log_weights.exp().numpy()[inside]
@@ -398,7 +404,7 @@ class Belief:
             UserError: The count is no whole number, 1 or more, or the seed none, 0 or more.
         """
         if not isinstance(count, int | np.integer) or isinstance(count, bool) or count < 1:
-            raise UserError(f"belief: draws {count} poses; expected a whole number, 1 or more")
+            raise UserError(f"belief: draws {count!r} poses; expected a whole number, 1 or more")
         generator = torch.Generator().manual_seed(check_seed(seed) % (1 << 63))
         return draw_poses(self._density, int(count), generator).numpy()
 
@@ -446,7 +452,7 @@ class Belief:
         """Write the belief as an .npz file; `Belief.load` reads it. The ending is added if missing.
 
         Its arrays are `poses` (N, 4, 4) and `weights` (N,) in float32, and `center`, `radius`,
-        `diameter`, `object` and `symmetries`.
+        `diameter`, `object`, `symmetries` and `draws`.
 
         Raises:
             UserError: It cannot be written.

@@ -1,5 +1,6 @@
 """A belief's file: arrays in an .npz, without pickle, whole or not there."""
 
+import os
 import zipfile
 from pathlib import Path
 from typing import Any
@@ -17,16 +18,19 @@ def write_arrays(path: str | Path, poses: np.ndarray, weights: np.ndarray, **oth
     Raises:
         UserError: The file cannot be written.
     """
-    if Path(path).is_dir():  # the file would be beside it
-        raise UserError(f"{path}: is a folder; name the file to write")
-    file = _with_suffix(path)
+    file = _name_file(path, "write")
     poses, weights = poses.astype(np.float32), weights.astype(np.float32)
     with open_whole(file, sync=False) as stream:
         np.savez_compressed(stream, poses=poses, weights=weights, **others)
 
 
-def _with_suffix(path: str | Path) -> Path:
+def _name_file(path: str | Path, to: str) -> Path:
+    """Return the file of a belief: its path, or that with the ending."""
+    if not isinstance(path, str | os.PathLike):
+        raise UserError(f"{path!r}: expected the path of a belief's file")
     file = Path(path)
+    if file.is_dir():  # the file would be beside it
+        raise UserError(f"{path}: is a folder; name the file to {to}")
     return file if file.suffix == ".npz" else file.with_name(f"{file.name}.npz")
 
 
@@ -36,7 +40,8 @@ def read_arrays(path: str | Path) -> dict[str, Any]:
     Raises:
         UserError: The file is missing, or holds no belief.
     """
-    file = Path(path) if Path(path).is_file() else _with_suffix(path)
+    named = _name_file(path, "read")
+    file = Path(path) if Path(path).is_file() else named
     if not file.is_file():
         raise UserError(f"{path}: no such file")
     try:

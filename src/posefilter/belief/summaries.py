@@ -157,7 +157,7 @@ def find_quantile(values: np.ndarray, weights: np.ndarray, q: float) -> float:
 def check_probability(name: str, value: float) -> None:
     """Raise UserError unless a quantile or level, which the message names, is in [0, 1]."""
     if not isinstance(value, Real | np.generic) or not 0 <= value <= 1:
-        raise UserError(f"belief: the {name} is between 0 and 1, and {value} is not")
+        raise UserError(f"belief: the {name} is between 0 and 1, and {value!r} is not")
 
 
 def measure_uncertainty(

@@ -96,7 +96,7 @@ def check_dataset(
 def format_report(report: dict[str, Any]) -> str:
     """Return the report as a table, and its problems below."""
     table = Table(
-        "object", "frames", "silhouette IoU", r"depth error \[mm]", "visible share", "empty masks"
+        "object", "frames", "silhouette IoU", r"depth error \[mm]", "visibility", "empty masks"
     )
     for row in report["objects"]:
         numbers = (

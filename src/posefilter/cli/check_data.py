@@ -70,5 +70,5 @@ def train_on(job: Job, name: str, images: int) -> str:
     if data.mesh_scale is not None:
         more["data__mesh_scale"] = data.mesh_scale
     if images < _FEW_IMAGES:  # the one image of a part may show little of the object
-        more |= {"data__min_visibility": 0.0, "data__min_visibility_test": 0.0}
+        more["data__min_visibility"] = 0.0
     return " ".join([typed("train", **more), *map(shlex.quote, options)])

@@ -94,7 +94,7 @@ def apply_prior(presence: float, probability: float, prior: float) -> tuple[floa
     """
     number = isinstance(prior, Real) and not isinstance(prior, bool)
     if not (number and 0 < prior < 1):
-        raise UserError(f"prior={prior}: must lie between 0 and 1, ends excluded")
+        raise UserError(f"prior={prior!r}: must lie between 0 and 1, ends excluded")
     there, absent = prior * presence, (1 - prior) * (1 - presence)
     adjusted = there / (there + absent)
     return adjusted, probability * adjusted / presence if presence else 0.0
