@@ -126,6 +126,19 @@ def test_an_object_is_magnified_to_the_size_that_is_asked_for() -> None:
         RollAndZoom(object_size=(0.4, 0.3))
 
 
+@pytest.mark.parametrize(
+    "step", [RandomCrop((32, 32), 0.0), RollAndZoom(0.5, 0.0, (1.5, 2.0), keep=0.1)]
+)
+def test_what_a_step_cuts_off_is_no_longer_visible(step: Augment) -> None:
+    before = dataclasses.replace(sample(), visibility=0.8)
+    shares = [apply(step, seed, before).visibility for seed in range(20)]
+    assert min(shares) < 0.7
+    assert max(shares) <= 0.8
+    smaller = apply(RollAndZoom(0.0, 0.0, (0.5, 0.5)), 0, before)
+    assert smaller.mask.sum() < 0.3 * before.mask.sum()
+    assert smaller.visibility == pytest.approx(0.8, rel=0.05), "smaller, and as visible"
+
+
 def test_a_window_shifts_the_principal_point() -> None:
     out = apply(RandomCrop((32, 32), uniform_probability=0.0), 0)
     assert out.rgb.shape == (32, 32, 3)

@@ -47,7 +47,8 @@ def look(
         torch.zeros(1, 2, 3),
         torch.zeros(1, *GRID, 0),
     )
-    return seen, Cells(points.view(1, *GRID, 3), torch.ones(1, *GRID, dtype=torch.bool))
+    known = torch.ones(1, *GRID, dtype=torch.bool)
+    return seen, Cells(points.view(1, *GRID, 3), known, torch.zeros(1, *GRID, 2))
 
 
 def measure(seen: tuple[Coordinates, Cells], stretch: Tensor | None = None) -> ApparentSize:

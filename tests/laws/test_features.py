@@ -53,7 +53,7 @@ def look(error: float, member: float, beside: int = 0) -> dict[str, float]:
     share = torch.zeros(1, 10, 20, 1)
     nothing = torch.zeros(1, 10, 20, 0)
     seen = Coordinates(logit.view(1, 10, 20), share, place, torch.zeros(1, 1, 3), nothing)
-    cells = Cells(points, torch.ones(1, 10, 20, dtype=torch.bool))
+    cells = Cells(points, torch.ones(1, 10, 20, dtype=torch.bool), torch.zeros(1, 10, 20, 2))
     found = measure_coordinates(pose, seen, cells, MODEL)
     return {name: float(value) for name, value in found.items()}
 

@@ -53,6 +53,8 @@ def test_towards_object_points_at_the_nearest_pixel_or_the_center_within_reach(
     assert inner[0].tolist() == [-5.0, 0.0]
     center = TowardsObject("center")(trace, batch, model)[0, 0]
     assert center.tolist() == [[-5.5, 0.5], [0.5, -0.5]]
+    absent = batch._replace(mask=torch.zeros_like(batch.mask))
+    assert not TowardsObject("center")(trace, absent, model).any(), "no object to go to"
     short = TowardsObject(max_displacement=0.1)(trace, batch, model)[0, 0]
     torch.testing.assert_close(short[0], f64([-2.0, 0.0]).to(short))
     with pytest.raises(UserError, match="nearest or center"):

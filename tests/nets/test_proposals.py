@@ -84,6 +84,18 @@ def test_a_cell_on_the_object_is_lifted_from_a_pixel_on_the_object() -> None:
         assert (cells.point[on][:, 2] - 0.8).abs().max() < 1e-6
 
 
+def test_a_hole_at_the_rim_is_not_filled_with_what_lies_beside_the_object() -> None:
+    mask = torch.zeros(1, 1, H, W, dtype=torch.bool)
+    mask[..., :12, :12] = True  # of cell (1, 1) one central pixel
+    depth = torch.where(mask, 0.8, 0.85)
+    depth[..., 11, 11] = 0
+    cells = measure_cells(depth, K)
+    assert cells.pixel[0, 1, 1].tolist() == [12, 12]
+    pose = make_pose(torch.eye(3), torch.tensor([0.0, 0.0, 0.8]))[None]
+    _, on, usable = true_coordinates(cells, mask, pose, torch.zeros(3), 1.0)
+    assert (on & ~usable)[0].nonzero().tolist() == [[1, 1]]
+
+
 def world(noise: float = 0.0, doubt: float = 0.0) -> tuple[Coordinates, Cells, Tensor]:
     """Return what a network says of cells on an object at a known pose, with Gaussian noise of so
     many radii.
@@ -111,7 +123,7 @@ def world(noise: float = 0.0, doubt: float = 0.0) -> tuple[Coordinates, Cells, T
     valid = torch.ones(1, h, w, dtype=torch.bool)
     return (
         Coordinates(logit, share.log(), place, MIDDLES[None], torch.zeros(1, h, w, 0)),
-        Cells(point, valid),
+        Cells(point, valid, measure_cells(torch.zeros(1, 1, h * STRIDE, w * STRIDE), K).pixel),
         pose,
     )
 
@@ -150,6 +162,7 @@ def test_an_image_without_depth_does_not_disturb_the_others() -> None:
     blind = Cells(
         torch.cat([torch.zeros_like(cells.point), cells.point]),
         torch.cat([~cells.valid, cells.valid]),
+        torch.cat([cells.pixel, cells.pixel]),
     )
     got = draw_poses(both, blind, CENTER, RADIUS, 50, torch.Generator().manual_seed(1))
     assert torch.isfinite(got).all()

@@ -31,7 +31,7 @@ def test_so_many_draws_keep_the_divergence() -> None:
 
 
 def test_one_bin_needs_one_particle_and_more_bins_more() -> None:
-    assert kld_size(1, 0.05, 0.99) == 1
+    assert kld_size(1, 0.05, 0.99) == kld_size(2, 0.001, 0.01) == 1
     sizes = [kld_size(k, 0.05, 0.99) for k in range(1, 200)]
     assert sizes == sorted(sizes)
     assert kld_size(20, 0.05, 0.99) > kld_size(20, 0.1, 0.99) > kld_size(20, 0.1, 0.9)

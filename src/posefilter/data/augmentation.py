@@ -98,6 +98,7 @@ class RollAndZoom:
             mask=mask,
             intrinsics=K_new.astype(np.float32),
             camera_from_object=pose.astype(np.float32),
+            visibility=_keep_visibility(sample, mask, zoom),
         )
 
     def _choose_by_size(self, sample: Sample, rng: Generator) -> float | None:
@@ -109,6 +110,12 @@ class RollAndZoom:
         size = np.sqrt(area / max(visible, _LEAST_VISIBLE)) / sample.mask.shape[1]
         wanted = np.exp(rng.uniform(*np.log(self.object_size)))
         return float(np.clip(wanted / size, self.zoom[0], _MOST_ZOOM))
+
+
+def _keep_visibility(sample: Sample, mask: np.ndarray, zoom: float = 1.0) -> float:
+    """Return the visible share of which a step leaves a mask, after enlarging it by a factor."""
+    whole = sample.mask.sum() * zoom**2
+    return sample.visibility * min(float(mask.sum() / whole), 1.0) if whole else sample.visibility
 
 
 @dataclasses.dataclass(frozen=True)
@@ -138,7 +145,14 @@ class RandomCrop:
         K = sample.intrinsics.copy()
         K[:2, 2] -= (left, top)
         rgb, depth, mask = (x[cut].copy() for x in (sample.rgb, sample.depth, sample.mask))
-        return dataclasses.replace(sample, rgb=rgb, depth=depth, mask=mask, intrinsics=K)
+        return dataclasses.replace(
+            sample,
+            rgb=rgb,
+            depth=depth,
+            mask=mask,
+            intrinsics=K,
+            visibility=_keep_visibility(sample, mask),
+        )
 
 
 def draw_rectangle(
@@ -213,7 +227,7 @@ class PasteOccluder:
         other = jitter_color(drawn[cut], rng, 1.0)
         rgb, depth = sample.rgb.copy(), sample.depth.copy()
         rgb[cut][patch], depth[cut][patch] = other[patch], surface[patch]
-        visibility = float(sample.visibility * mask.sum() / sample.mask.sum())
+        visibility = _keep_visibility(sample, mask)
         return dataclasses.replace(sample, rgb=rgb, depth=depth, mask=mask, visibility=visibility)
 
 
@@ -245,12 +259,14 @@ class RandomErasing:
 
 @dataclasses.dataclass(frozen=True)
 class DepthNoise:
-    """Scale and shift depth as a badly calibrated sensor does, and add noise that grows with z
-    squared.
+    """Scale depth as a badly calibrated sensor does, and add noise that grows with z squared.
+
+    The noise of an image is white at half its size, of a standard deviation that is uniform from 0
+    to `noise`, and enlarged bilinearly, which leaves 0.6 of it.
     """
 
-    scale: float = 0.004
-    noise: float = 0.0015  # [1/m]: standard deviation at 1 m, in meters
+    scale: float = 0.004  # standard deviation
+    noise: float = 0.0015  # [1/m]: the largest standard deviation at 1 m, in meters
 
     def __call__(self, sample: Sample, draw: Draw, rng: Generator) -> Sample:
         """Return the sample with noisy depth; unknown pixels stay unknown."""

@@ -1,10 +1,10 @@
 """Photometric augmentation: a color model of real cameras.
 
-The sensor model of the renderer and the color jitter of `augment.py` leave hues where the texture
-has them. Real cameras do not: their filters mix the channels, their white balance tints, and scans
-of textures are faded. Each step here is a callable `(Sample, draw, rng) -> Sample` that changes
-color alone; pose, camera, depth and mask stay as they are. A step of strength 0 returns the image
-bit for bit, and takes the same number of draws as at any other strength.
+The sensor model of the renderer and the color jitter of `augmentation.py` leave hues where the
+texture has them. Real cameras do not: their filters mix the channels, their white balance tints,
+and scans of textures are faded. Each step here is a callable `(Sample, draw, rng) -> Sample` that
+changes color alone; pose, camera, depth and mask stay as they are. A step of strength 0 returns the
+image bit for bit, and but for `Sticker` takes as many draws as at any other strength.
 """
 
 import dataclasses

@@ -16,7 +16,7 @@ class TowardsObject:
 
     Args:
         target: "nearest" for the nearest mask pixel (zero on the mask), or "center" for the mask's
-            centroid.
+            centroid.  Without a mask both are zero.
         margin_px: Erosion of the mask for `nearest` [px], where the mask is wide enough.
         max_displacement: Maximum length, in frame widths; longer ones keep their direction.
 
@@ -39,7 +39,8 @@ class TowardsObject:
         """Return (T, B, N, 2) [px], without gradient."""
         states = torch.stack([particles.state for particles in trace.particles])
         if self.target == "center":
-            goal = centroid(batch.mask)[:, None].expand_as(states)
+            shown = batch.mask.flatten(1).any(1)[:, None, None]
+            goal = torch.where(shown, centroid(batch.mask)[:, None], states)
         else:
             flat = states.transpose(0, 1).flatten(1, 2)
             goal = nearest_mask_pixel(erode(batch.mask, self.margin_px), flat)

@@ -14,8 +14,9 @@ from posefilter.types import Batch, ObjectModel, Trace
 class Heatmaps:
     """Cross-entropy of each cell against a Gaussian about the keypoint, summed over each map.
 
-    Keypoints out of the frame have an empty map; hidden ones are drawn as any other. DOPE has the
-    squared error, whose gradient is near zero while a new network takes all cells for empty.
+    Keypoints behind the camera have an empty map; of those beside the frame it has what reaches
+    into it, and hidden ones are drawn as any other. DOPE has the squared error, whose gradient is
+    near zero while a new network takes all cells for empty.
 
     The trace's encoding has `logits` (B, 9, h, w), `keypoints` (9, 3) in the object's frame [m] and
     `stride`, the pixels of a cell.

@@ -52,6 +52,7 @@ class Cells(NamedTuple):
 
     point: Tensor  # (B, h, w, 3) camera point [m]
     valid: Tensor  # (B, h, w) bool: depth is known there
+    pixel: Tensor  # (B, h, w, 2) that it was lifted from, of images of whole cells [px]
 
 
 def whole_cells(image: Tensor) -> Tensor:
@@ -74,14 +75,17 @@ def true_coordinates(
 
     Returns:
         The object point of each cell (B, h, w, 3), from the center, in radii; whether the cell's
-        central pixel is on the object (B, h, w) bool; and whether its depth is valid too, bool.
-        That pixel is the first whose depth is measured (`measure_cells`): at the object's rim the
-        next one may show what lies behind it.
+        central pixel is on the object (B, h, w) bool; and whether, too, so is the pixel whose depth
+        was taken (`measure_cells`), bool: at the object's rim the next one may show what lies
+        behind it.
     """
-    on = whole_cells(mask)[:, 0, CENTRAL::STRIDE, CENTRAL::STRIDE]
+    mask = whole_cells(mask)[:, 0]
+    on = mask[:, CENTRAL::STRIDE, CENTRAL::STRIDE]
+    u, v = cells.pixel.long().flatten(1, 2).unbind(-1)
+    lifted = mask.flatten(1).gather(1, v * mask.shape[-1] + u).view_as(on)
     R, t = camera_from_object[:, None, :3, :3], camera_from_object[:, None, None, :3, 3]
     truth = ((cells.point - t) @ R - center) / radius
-    return truth, on, on & cells.valid & within_bounds(truth)
+    return truth, on, on & lifted & cells.valid & within_bounds(truth)
 
 
 def coordinate_loss(

@@ -63,7 +63,10 @@ def geometry(depth: Tensor, K: Tensor) -> Tensor:
 
 
 def upsample_like(x: Tensor, like: Tensor) -> Tensor:
-    """Interpolate a map to the size of another.  (B, C, h, w), (B, *, H, W) -> (B, C, H, W)."""
+    """Interpolate a map to the size of another.  (B, C, h, w), (B, *, H, W) -> (B, C, H, W).
+
+    Where half of an odd side was rounded up, the map is stretched, by less than a cell of its own.
+    """
     return F.interpolate(x, size=like.shape[-2:], mode="bilinear", align_corners=False)
 
 

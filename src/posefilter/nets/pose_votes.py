@@ -29,7 +29,7 @@ def measure_cells(depth: Tensor, K: Tensor) -> Cells:
         offset = torch.tensor([col, row], dtype=depth.dtype, device=depth.device) + CENTRAL
         pixel = torch.where(take[..., None], corner + offset, pixel)
     point = back_project(pixel.flatten(1, 2), z.flatten(1), K).unflatten(1, (h, w))
-    return Cells(point, z > 0)
+    return Cells(point, z > 0, pixel)
 
 
 def has_depth(batch: Batch) -> Tensor:

@@ -34,7 +34,7 @@ def kld_size(bins: int, epsilon: float, quantile: float) -> int:
         return 1
     a = 2 / (9 * (bins - 1))
     z = NormalDist().inv_cdf(quantile)
-    return math.ceil((bins - 1) / (2 * epsilon) * (1 - a + math.sqrt(a) * z) ** 3)
+    return max(1, math.ceil((bins - 1) / (2 * epsilon) * (1 - a + math.sqrt(a) * z) ** 3))
 
 
 def bin_poses(poses: Tensor, about: Tensor, space: PoseSpace, width: float) -> Tensor:
