@@ -3,12 +3,11 @@
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import cv2
 import numpy as np
 import torch
 
 from posefilter.data.readers.plausible import find_center_flaw, find_focal_flaw
-from posefilter.data.resize import network_size, resize_depth
+from posefilter.data.resize import network_size, resize_depth, resize_image
 from posefilter.errors import UserError
 from posefilter.geometry.camera import find_matrix_flaw, resize_intrinsics
 from posefilter.limits import FEWEST_KNOWN, MOST_SIDE
@@ -122,8 +121,7 @@ def make_sized_batch(images: Images, height: int, width: int) -> Batch:
     before = images.depth.shape[1:]
     rgb, depth, K = list(images.rgb), list(images.depth), torch.from_numpy(images.intrinsics)
     if (height, width) != before:
-        how = cv2.INTER_AREA if width <= before[1] else cv2.INTER_LINEAR
-        rgb = [cv2.resize(one, (width, height), interpolation=how) for one in rgb]
+        rgb = [resize_image(one, height, width) for one in rgb]
         depth = [resize_depth(one, height, width) for one in depth]
         K = resize_intrinsics(K, width / before[1], height / before[0])
     color = torch.from_numpy(np.ascontiguousarray(np.stack(rgb).transpose(0, 3, 1, 2)))

@@ -56,14 +56,14 @@ def resize(sample: Sample, height: int, width: int) -> Sample:
     K = resize_intrinsics(K, width / before[1], height / before[0])
     return dataclasses.replace(
         sample,
-        rgb=_average(sample.rgb, height, width),
+        rgb=resize_image(sample.rgb, height, width),
         depth=resize_depth(sample.depth, height, width),
         mask=resize_mask(sample.mask, height, width),
         intrinsics=K.numpy().astype(np.float32),
     )
 
 
-def _average(image: np.ndarray, height: int, width: int) -> np.ndarray:
+def resize_image(image: np.ndarray, height: int, width: int) -> np.ndarray:
     """Return an image at another size: averaged where it shrinks, else interpolated."""
     shrinks = height <= image.shape[0] and width <= image.shape[1]
     how = cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR
@@ -76,7 +76,7 @@ def resize_mask(mask: np.ndarray, height: int, width: int) -> np.ndarray:
     Ties are decided as on a chess board: the nearest old pixel would shift masks by a sixth of a
     pixel at half the size.
     """
-    share = _average(mask.astype(np.float32), height, width)
+    share = resize_image(mask.astype(np.float32), height, width)
     even = (np.arange(height)[:, None] + np.arange(width)) % 2 == 0
     return (share > 0.5 + 1e-4) | ((share > 0.5 - 1e-4) & even)
 
