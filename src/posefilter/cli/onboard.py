@@ -50,8 +50,8 @@ RECORD = "onboarding.json"
 _SPEED = ("seconds_per_step", "seconds_per_image")  # known once some frames are rendered
 _PLANNED = ("steps", *_SPEED, "seconds_per_frame")  # the steps, once the training begins
 FOUND = {**dict.fromkeys(_PLANNED, NUMBER), "concerns": [TEXT], "facts": {}, "training": {}}
-_FRAMES_A_MINUTE, _FEWEST_FRAMES, _MOST_FRAMES = 100, 200, 4000
-_FEWEST_STEPS, _MOST_STEPS = 100, 8000
+_FRAMES_A_MINUTE, _FEWEST_FRAMES, _MOST_FRAMES = 100, 200, 6000
+_FEWEST_STEPS, _MOST_STEPS = 100, 20000
 # Rendered, at most, as those in which enough of the object is seen are fewer.
 _VAL_FRAMES, _TEST_FRAMES = 90, 120
 _VALIDATED = 8  # images, once at the end
@@ -227,6 +227,8 @@ class Onboarding:
         if steps is None:
             steps, seconds = self.plan(speed, self.spent)
             return float(steps * seconds) + self.to_render + self.rest(speed)
+        if any(one.name == "train" and self.is_done(one) for one in STAGES):
+            return self.rest(speed)  # it may have ended by its time, before all of its steps
         done = 0
         with suppress(UserError):  # none yet, or a broken one
             done = step_of(self.training / "checkpoints" / LAST)
