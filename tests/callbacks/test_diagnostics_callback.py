@@ -21,6 +21,7 @@ from posefilter.callbacks.diagnostics import (
 from posefilter.figures.canvas import AXES
 from posefilter.geometry.spaces import PixelSpace
 from posefilter.metrics.diagnostics import FilterDiagnostics
+from posefilter.models.base import Trained
 from posefilter.types import BeliefBatch, ParticleOutput, Particles, Step, Trace
 
 
@@ -54,7 +55,10 @@ def test_drift_is_seen_in_numbers_curves_and_files(tmp_path: Path) -> None:
     signs.update(run, batch)
     hull = torch.zeros(4, 3)
     method = SimpleNamespace(
-        scores={"diagnostics": signs}, space=PixelSpace(), object_model=SimpleNamespace(hull=hull)
+        scores={"diagnostics": signs},
+        space=PixelSpace(),
+        object_model=SimpleNamespace(hull=hull),
+        trained=Trained(7, 0),
     )
     callback = Diagnostics(tmp_path, images=1)
     callback.on_validation_epoch_start(trainer, method)  # type: ignore[arg-type]

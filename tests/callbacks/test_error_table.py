@@ -21,6 +21,7 @@ from posefilter.geometry.pose import make_pose
 from posefilter.metrics.collect import PoseErrors
 from posefilter.metrics.image_errors import FILE, ImageError, read_errors, write_errors
 from posefilter.metrics.scores import summarize
+from posefilter.models.base import Trained
 from posefilter.types import ObjectModel
 
 ROW = ImageError(
@@ -87,6 +88,7 @@ class Method(torch.nn.Module):
     """What the callback uses of a method."""
 
     calibration = True
+    trained = Trained(3, 0)
 
 
 @pytest.fixture

@@ -84,9 +84,12 @@ def test_a_validation_is_at_the_step_that_the_model_had_come_to(trained: Path) -
     assert filters
     assert {event.step for event in logged.Scalars(filters[0])} == validations
     assert max(validations) == 8
-    assert {event.step for event in logged.Scalars("test/add/auc")} == {8}
+    tested = read(trained)["training"]["tested_step"]
+    assert {event.step for event in logged.Scalars("test/add/auc")} == {tested}
+    assert "6_test/worst" in tags["images"]
     for tag in tags["images"]:
-        assert max(event.step for event in logged.Images(tag)) == 8, tag  # none stays behind
+        last = max(event.step for event in logged.Images(tag))
+        assert last == (tested if tag.startswith("6_test") else 8), tag  # none stays behind
 
 
 def test_a_run_leaves_what_was_promised(trained: Path) -> None:

@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 import torch
 from omegaconf import OmegaConf
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from tests.smoke.conftest import HOME, SMALL_POSE_PF, TINY
 
 from posefilter.cli import reuse, run_command
@@ -20,7 +21,7 @@ def test_jobs_that_learn_the_same_are_trained_once_and_a_failed_one_is_reported(
     tiny_scenes: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
     typed = [*TINY, f"data.root={tiny_scenes}", "trainer.max_steps=2", *SMALL_POSE_PF]
-    typed += ["-m", "filter.particles=4,0,8", f"out={tmp_path}"]
+    typed += ["logger=tensorboard", "-m", "filter.particles=4,0,8", f"out={tmp_path}"]
     assert run_command("train", HOME, typed) == 2
     out, err = capfd.readouterr()
     assert err.splitlines()[-1] == f"train: 1 of 3 jobs failed: see {tmp_path}/summary.md"
@@ -45,6 +46,11 @@ def test_jobs_that_learn_the_same_are_trained_once_and_a_failed_one_is_reported(
     training = json.loads((runs[1] / "metrics.json").read_text())["training"]
     assert training["trained_as"] == first["folder"]
     assert training["steps"] == 2
+    for run in runs:  # the one that is only tested, too
+        logged = EventAccumulator(str(run), size_guidance={"images": 0}).Reload()
+        tested = {event.step for event in logged.Scalars("test/add/auc")}
+        assert tested == {event.step for event in logged.Images("6_test/worst")}
+        assert tested == {training["tested_step"]}
 
 
 @pytest.mark.slow

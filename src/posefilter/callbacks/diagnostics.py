@@ -83,22 +83,23 @@ class Diagnostics(BudgetedCallback):
         if "diagnostics" in scores and trainer.is_global_zero:
             found = cast(FilterDiagnostics, scores["diagnostics"]).compute()
             figure = draw_diagnostics(found, "Diagnostics\nof the test")
-            post_image(trainer, "diagnostics", figure, self.folder, "test")
+            step = cast(PoseEstimator, pl_module).trained.step
+            post_image(trainer, "diagnostics", figure, self.folder, "test", step)
 
     def draw(self, trainer: Trainer, method: PoseEstimator, trace: Trace, batch: Batch) -> None:
         """Draw and animate the trajectories of a batch's first images."""
-        states = trace_lineage(trace.particles)
+        states, step = trace_lineage(trace.particles), method.trained.step
         for i in range(min(self.images, len(states))):
             rgb, mask = to_image(batch.rgb[i]), batch.mask[i, 0].cpu().numpy()
             name = name_frame(trainer, "test", int(batch.frame_id[i]))
             title = f"Trajectories\n{name} of the test"
             picture = draw_trajectories(rgb, mask, states[i].cpu().numpy(), title)
-            post_image(trainer, f"trajectories_{i}", picture, self.folder, "test")
+            post_image(trainer, f"trajectories_{i}", picture, self.folder, "test", step)
             pair = (batch.intrinsics, batch.camera_from_object)
             K, truth = (x[i].cpu().double().numpy() for x in pair)
             title = f"The filter at work\n{name} of the test"
             animation = animate(method, select_image(trace, i), rgb, K, truth, mask, title)
-            post_image(trainer, f"animation_{i}", animation, self.folder, "test")
+            post_image(trainer, f"animation_{i}", animation, self.folder, "test", step)
 
 
 def has_pixel_particles(trace: Trace) -> bool:

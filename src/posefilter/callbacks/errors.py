@@ -68,7 +68,8 @@ class ErrorTable(TraceCallback):
             if kept:
                 title = f"The {len(kept)} {name} images\nof {len(self.rows)} of the test"
                 figure = draw_gallery(kept, shape, "pose" in pl_module.capabilities, title)
-                post_image(trainer, name, figure, self.folder / "figures", "test")
+                folder, step = self.folder / "figures", pl_module.trained.step
+                post_image(trainer, name, figure, folder, "test", step)
 
 
 def measure_batch(

@@ -33,7 +33,7 @@ from posefilter.cli.report import compared, write_page
 from posefilter.cli.resume import LAST
 from posefilter.cli.reuse import step_of
 from posefilter.cli.stages import Stages
-from posefilter.cli.train import build, finish, fit, test
+from posefilter.cli.train import build, finish, fit, read_trained, test
 from posefilter.confidence.fit import FEWEST
 from posefilter.data.generated_scenes import count_frames
 from posefilter.devices import choose_device
@@ -499,8 +499,9 @@ def calibrate(work: Onboarding) -> None:
 def evaluate(work: Onboarding) -> None:
     """Test the weights on held-out renders, with the second look that their calibration allows."""
     move_evaluation(work.training)  # which a user made in that folder
-    training = {**work.stages.values["training"], "tested_step": step_of(work.run.best)}
-    results = test(work.run, read_checkpoint(work.weights))
+    tested_at = read_trained(read_checkpoint(work.run.best))
+    training = {**work.stages.values["training"], "tested_step": tested_at.step}
+    results = test(work.run, read_checkpoint(work.weights), tested_at)
     finish(work.run, training, results, work.weights)
 
 

@@ -33,7 +33,7 @@ from posefilter.data.loaders import count_batches
 from posefilter.data.module import PoseDataModule
 from posefilter.errors import Stopped, UserError, naming
 from posefilter.metrics.results import compute_checkpoint_score
-from posefilter.models.base import PoseEstimator
+from posefilter.models.base import PoseEstimator, Trained
 from posefilter.models.rehearsal import check_method
 from posefilter.paths import stays_inside
 from posefilter.types import Batch
@@ -65,8 +65,9 @@ def train(job: Job) -> float:
         run = build(job)
         training = take_over(job) or fit(run)
         checkpoint = read_checkpoint(run.best)
-        training |= {"tested_step": int(checkpoint["global_step"])}
-        metrics = finish(run, training, test(run, checkpoint))
+        tested_at = read_trained(checkpoint)
+        training |= {"tested_step": tested_at.step}
+        metrics = finish(run, training, test(run, checkpoint, tested_at))
     return compute_checkpoint_score(metrics)
 
 
@@ -241,9 +242,18 @@ def _raised_by_lightning(error: Exception) -> bool:
     return bool(frames) and any(Path(frames[-1].filename).is_relative_to(at) for at in folders)
 
 
-def test(run: Run, checkpoint: dict[str, Any]) -> dict[str, Any]:
-    """Test what a checkpoint holds, built anew from it alone, as `evaluate.py` would."""
+def read_trained(checkpoint: dict[str, Any]) -> Trained:
+    """Return how far the weights of a run's checkpoint have been trained."""
+    return Trained(int(checkpoint["global_step"]), int(checkpoint["epoch"]))
+
+
+def test(run: Run, checkpoint: dict[str, Any], tested_at: Trained) -> dict[str, Any]:
+    """Test what a checkpoint holds, built anew from it alone, as `evaluate.py` would.
+
+    tested_at: The results are logged there.
+    """
     method = method_of(checkpoint)
+    method.tested_at = tested_at
     try:
         with stopped_by_interrupt():
             run.trainer.test(method, datamodule=run.data, verbose=False)

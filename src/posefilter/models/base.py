@@ -11,7 +11,7 @@ import itertools
 import time
 from collections.abc import Callable, Iterable
 from functools import cache, cached_property
-from typing import TYPE_CHECKING, Any, ClassVar, Self
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, Self
 
 import torch
 from torch import Generator, Tensor, nn
@@ -51,6 +51,13 @@ else:
 
 SEEDS = 1 << 63  # a generator takes smaller ones
 _STAGES = {"train": 0, "validate": 1, "test": 2, "predict": 3}
+
+
+class Trained(NamedTuple):
+    """How far weights have been trained."""
+
+    step: int
+    epoch: int
 
 
 class PoseEstimator(Module):
@@ -102,6 +109,7 @@ class PoseEstimator(Module):
         self.clipper = SubmoduleClipper()
         self.time_spent = 0.0  # share of the training's time budget, where it has one
         self.recipe: dict[str, Any] = {}  # how it was built: plain data, carried in its checkpoints
+        self.tested_at: Trained | None = None  # of a checkpoint that is tested
 
     def set_object(self, object_model: ObjectModel) -> None:
         """Set the object, and forget the metrics of another.
@@ -455,6 +463,13 @@ class PoseEstimator(Module):
         """Log the metrics."""
         self._log_metrics("test")
 
+    @property
+    def trained(self) -> Trained:
+        """How far the weights have been trained: the trainer's count, unless a checkpoint is
+        tested, which may be of an earlier step or of another run.
+        """
+        return self.tested_at or Trained(self.trainer.global_step, self.trainer.current_epoch)
+
     def _log_metrics(self, split: str) -> dict[str, Any]:
         """Log the metrics of a split, and return them.
 
@@ -462,8 +477,8 @@ class PoseEstimator(Module):
         from 0, one less, and adds the epoch.
         """
         results = self.compute_metrics()
-        self.log("step", float(self.trainer.global_step))
-        self.log("epoch", float(self.trainer.current_epoch))
+        for name, value in self.trained._asdict().items():
+            self.log(name, float(value))
         self.log_dict({f"{split}/{name}": value for name, value in flatten(results).items()})
         return results
 
