@@ -6,6 +6,7 @@ from types import SimpleNamespace
 from typing import Any
 
 import torch
+from lightning import LightningModule, Trainer
 from lightning.pytorch.loggers import TensorBoardLogger
 from omegaconf import OmegaConf
 from tensorboard.backend.event_processing.data_provider import MultiplexerDataProvider
@@ -17,6 +18,7 @@ from tensorboard.plugins.custom_scalar.layout_pb2 import Layout
 from tensorboard.plugins.hparams.backend_context import Context
 from tensorboard.plugins.hparams.plugin_data_pb2 import HParamsPluginData
 from tensorboard.util.tensor_util import make_ndarray
+from torch.utils.data import DataLoader
 
 from posefilter.callbacks.tensorboard_layout import LAYOUT, TensorBoardLayout
 
@@ -100,6 +102,30 @@ def test_each_run_is_listed_once(tmp_path: Path) -> None:
     runs, _, lines = read_experiment(tmp_path)
     assert sorted(runs) == sorted(lines) == ["a", "b"]
     assert not [path for path in tmp_path.rglob("hparams*") if path.is_dir()]
+
+
+def test_a_run_that_is_only_tested_is_listed_with_its_settings(tmp_path: Path) -> None:
+    """As a sweep's job is whose weights another job has learned; once, where it was trained."""
+    logger = TensorBoardLogger(tmp_path / "a", name="", version="")
+    layout, method = TensorBoardLayout(), LightningModule()
+    layout.settings = {"filter.particles": 50}
+    trainer = Trainer(
+        logger=logger,
+        callbacks=[layout],
+        accelerator="cpu",
+        enable_progress_bar=False,
+        enable_checkpointing=False,
+        limit_test_batches=1,
+    )
+    method.test_step = lambda *_: None  # type: ignore[assignment, method-assign]
+    for _ in range(2):
+        trainer.test(method, DataLoader([torch.zeros(1)]), verbose=False)
+    logger.finalize("success")
+    _, _, lines = read_experiment(tmp_path)
+    assert lines == ["a"]
+    assert OmegaConf.load(tmp_path / "a" / "hparams.yaml") == layout.settings
+    board = EventAccumulator(str(tmp_path / "a"), size_guidance={"tensors": 0}).Reload()
+    assert len(board.Tensors("custom_scalars__config__")) == 1
 
 
 def test_what_matters_is_shown_first(tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 import signal
 import warnings
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -9,7 +10,8 @@ import torch
 from omegaconf import OmegaConf
 
 from posefilter.cli import run_command
-from posefilter.cli.build import make_trainer, quiet
+from posefilter.cli.build import list_swept, make_trainer, quiet
+from posefilter.cli.job import Job
 from posefilter.errors import UserError
 
 HOME = Path(__file__).parents[2]
@@ -24,6 +26,20 @@ SLURM = {
 def in_slurm(monkeypatch: pytest.MonkeyPatch) -> None:
     for name, value in SLURM.items():
         monkeypatch.setenv(name, value)
+
+
+def test_what_all_jobs_of_a_sweep_share_is_not_swept(tmp_path: Path) -> None:
+    """Neither what was typed of all, nor a choice of one value."""
+    words = ["budget=short", "tags=[a,b]", "filter.particles=50", "model.net.width=16", "seed=1"]
+    job = Job(OmegaConf.create({}), {}, words, tmp_path / "job", "train", True)
+    assert list_swept(job) == tuple(word.partition("=")[0] for word in words)  # not known
+    task = ["budget=short", "tags=[a,b]", "filter.particles=50,100", "model.net.width=choice(16)"]
+    sweeper = {"params": {"seed": "range(0,3)"}}
+    OmegaConf.save(
+        {"hydra": {"sweeper": sweeper, "overrides": {"task": task}}}, tmp_path / "multirun.yaml"
+    )
+    assert set(list_swept(job)) == {"filter.particles", "seed"}
+    assert list_swept(replace(job, swept=False)) == ()
 
 
 @pytest.mark.usefixtures("in_slurm")

@@ -102,6 +102,7 @@ class TensorBoardLayout(Callback):
         self.swept: tuple[str, ...] = ()
         self._best = float("-inf")
 
+        self._written = False
     def state_dict(self) -> dict[str, Any]:
         """Return what a resumed run goes on with."""
         return {"best": self._best}
@@ -111,8 +112,19 @@ class TensorBoardLayout(Callback):
         self._best = float(state_dict["best"])
 
     def on_fit_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+    def setup(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
+        """Write layout and settings of a run that is only tested, as a sweep's job may be: before
+        Lightning writes hparams.yaml.
+        """
+        if stage == "test" and not self._written:
+            self._write(trainer)
+
         """Write layout and settings."""
         if not trainer.is_global_zero:
+        self._write(trainer)
+
+    def _write(self, trainer: Trainer) -> None:
+        self._written = True
             return
         for board in get_boards(trainer):
             board.hparams.update(self.settings)  # which Lightning writes to hparams.yaml

@@ -7,6 +7,8 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.override_parser.types import Override
 from lightning import Callback, Trainer
 from lightning.pytorch.loggers import Logger, TensorBoardLogger
 from lightning.pytorch.plugins.environments import SLURMEnvironment
@@ -123,7 +125,7 @@ def build_trainer(job: Job) -> Trainer:
     for layout in callbacks:
         if isinstance(layout, TensorBoardLayout):
             layout.settings = comparable(job)
-            layout.swept = tuple(map(key_of, job.overrides if job.swept else ()))
+            layout.swept = list_swept(job)
     callbacks += [progress(cfg.console), FinalValidation()]
     loggers: list[Logger] = _build_all(cfg.get("logger"), "logger", Logger)
     for logger in loggers:
@@ -138,6 +140,28 @@ def build_trainer(job: Job) -> Trainer:
             "without -m"
         )
     return trainer
+
+
+def list_swept(job: Job) -> tuple[str, ...]:
+    """Return the settings in which a sweep's jobs differ, as far as that is known: else all that
+    were typed.
+    """
+    from posefilter.report.sweeps import read_asked
+
+    if not job.swept:
+        return ()
+    folder = next((one for one in job.folder.parents if (one / "multirun.yaml").is_file()), None)
+    if folder is None:  # not Hydra's own sweeper
+        return tuple(map(key_of, job.overrides))
+    asked = [f"{key}={values}" for key, values in read_asked(folder).items()]
+    parsed = OverridesParser.create().parse_overrides(asked)
+    return tuple(own.key_or_group for own in parsed if _is_varied(own))
+
+
+def _is_varied(override: Override) -> bool:
+    """Tell whether an override is swept over several values: a choice may be of one."""
+    single = override.is_choice_sweep() and len([*override.sweep_string_iterator()]) == 1
+    return override.is_sweep_override() and not single
 
 
 def _check_trainer(node: DictConfig) -> None:

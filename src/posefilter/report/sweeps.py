@@ -149,14 +149,19 @@ def read_declared(folder: Path) -> dict[str, list[Value]]:
     """Return the values of each axis in the order in which they were asked for, as far as that is
     told.
     """
+    return {
+        key: [parse_number(value.strip()) for value in values.split(",")]
+        for key, values in read_asked(folder).items()
+    }
+
+
+def read_asked(folder: Path) -> dict[str, str]:
+    """Return what a sweep was asked for: the values of each setting, swept or not, as typed."""
     file = folder / "multirun.yaml"
     content = read_yaml(file)
     asked = dict(read_part(content, ("hydra", "sweeper", "params"), file))
     asked |= read_typed(read_texts(read_part(content, ("hydra", "overrides"), file), "task", file))
-    return {
-        str(key): [parse_number(value.strip()) for value in str(values).split(",")]
-        for key, values in asked.items()
-    }
+    return {str(key): str(values) for key, values in asked.items()}
 
 
 def make_sort_key(order: Sequence[Value]) -> Callable[[Value], tuple[int, float, str]]:
