@@ -144,3 +144,32 @@ def test_a_job_that_was_started_again_meanwhile_has_not_failed(
     assert json.loads(capfd.readouterr().out.splitlines()[-1])["failed"] == []
     assert not [*tmp_path.rglob("failed.json")]
     assert len(read_sweep(tmp_path).jobs) == 2
+
+
+def test_the_legend_lies_beside_the_data(tmp_path: Path) -> None:
+    """Lines at the top and at the bottom leave no room within the axes."""
+    jobs = [
+        Job({"steps": n, "refine": kind, "seed": s}, {"add/auc": auc + s}, f"{n}{kind}{s}")
+        for n in (1, 2, 3)
+        for kind, auc in (("none", 2.0), ("gradient", 50.0), ("icp", 97.0))
+        for s in (0, 1)
+    ]
+    figure = draw(Sweep(tmp_path, ["steps", "refine", "seed"], jobs, []))
+    figure.canvas.draw()
+    legends = [legend for part in figure.subfigs for legend in part.legends]
+    assert [text.get_text() for text in legends[0].get_texts()] == [
+        f"refine={kind}" for kind in ("none", "gradient", "icp")
+    ]
+    for legend in legends:
+        area = legend.get_window_extent()
+        assert not any(area.overlaps(axes.get_tightbbox()) for axes in figure.axes)
+    assert not any(axes.get_legend() for axes in figure.axes)
+
+
+def test_an_error_stays_in_its_cell(tmp_path: Path) -> None:
+    (tmp_path / "seed=1").mkdir()
+    note = {"overrides": ["seed=1"], "error": "give data=fat|bop\nand data.root=DIR"}
+    (tmp_path / "seed=1" / "failed.json").write_text(json.dumps(note))
+    summarize(tmp_path)
+    *_, row = (tmp_path / "summary.md").read_text().splitlines()
+    assert row == r"| give data=fat\|bop and data.root=DIR |"

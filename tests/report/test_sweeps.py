@@ -14,7 +14,7 @@ from posefilter.errors import UserError
 from posefilter.metrics.image_errors import FILE, ImageError, write_errors
 from posefilter.metrics.registry import find_metric
 from posefilter.report.gather import read_run
-from posefilter.report.sweep_charts import chart_over, name_axis
+from posefilter.report.sweep_charts import chart_against_time, chart_over, draw_summary, name_axis
 from posefilter.report.sweep_page import (
     format_mean,
     format_spread,
@@ -113,6 +113,53 @@ def test_of_a_symmetric_object_the_best_is_up_to_symmetry(tmp_path: Path) -> Non
     assert find_best_job(Sweep(tmp_path, ["steps"], jobs, [])).place == {"steps": 1}
 
 
+def test_what_is_said_of_the_best_of_a_symmetric_object_is_up_to_symmetry(tmp_path: Path) -> None:
+    """The same error decides, is named, and is drawn."""
+    error = "add_up_to_symmetry"
+
+    def make_sweep(seeds: int, auc: float) -> Sweep:
+        rows = ((50, 30.0, 80.0, 97.0, 2.0), (100, 70.0, 8.0, auc, 5.0))
+        jobs = [
+            Job(
+                {"filter.particles": n, **({"seed": seed} if seeds > 1 else {})},
+                {"add/auc": plain, "add/median_mm": far, f"{error}/auc": own,
+                 f"{error}/median_mm": near, "seconds_per_image": n / 500},
+                f"{n}_{seed}",
+            )
+            for n, plain, far, own, near in rows
+            for seed in range(seeds)
+        ]  # fmt: skip
+        return Sweep(tmp_path, ["filter.particles", *(["seed"] if seeds > 1 else [])], jobs, [])
+
+    tied = make_sweep(1, 97.01)
+    assert find_best_job(tied).place == {"filter.particles": 50}
+    head = str(head_lines(tied, find_best_job(tied))[0])
+    assert (
+        "2 runs have its score to one decimal; it has the least median ADD up to symmetry" in head
+    )
+    several = make_sweep(2, 90.0)
+    head = str(head_lines(several, find_best_job(several))[0])
+    assert "(ADD up to symmetry AUC 97.0 ± 0.0, mean of 2 seeds)" in head
+    (panel,) = chart_against_time(group_jobs(several))
+    assert (panel.title, list(panel.lines[0].y)) == ("ADD up to symmetry AUC", [97.0])
+    figure = draw_summary(several)
+    assert figure is not None
+    titles = [axes.get_title(loc="left") for axes in figure.axes]
+    assert titles == ["ADD up to symmetry AUC", "time per image [s]"]
+
+
+def test_detectors_that_tie_have_no_median(tmp_path: Path) -> None:
+    numbers = {"iou": 0.5, "particles_on_object": 0.7}
+    jobs = [Job({"filter.particles": n}, numbers, str(n)) for n in (50, 100)]
+    found = Sweep(tmp_path, ["filter.particles"], jobs, [])
+    head = str(head_lines(found, find_best_job(found))[0])
+    assert "2 runs have its score to one decimal; it is the first of them" in head
+    seeds = [job._replace(place={**job.place, "seed": s}) for job in jobs for s in (0, 1)]
+    found = Sweep(tmp_path, ["filter.particles", "seed"], seeds, [])
+    head = str(head_lines(found, find_best_job(found))[0])
+    assert "(box IoU 0.500 ± 0.000, particles on the object 70.0 ± 0.0, mean of 2 seeds)" in head
+
+
 def test_where_scores_tie_the_median_names_the_best(sweep: Path) -> None:
     """To one decimal: a hundredth of a point more is no better, a tenth is."""
     best, other = (
@@ -133,7 +180,7 @@ def test_where_scores_tie_the_median_names_the_best(sweep: Path) -> None:
 
 @pytest.mark.parametrize(("auc", "ties"), [(80.46, 2), (80.4, 1)])
 def test_ties_of_single_runs_are_said(tmp_path: Path, auc: float, ties: int) -> None:
-    rows = f"filter.particles,add_auc,seconds_per_image,folder\n1000,80.5,2,b\n50,{auc},1,a\n"
+    rows = f"filter.particles,add_auc,add_median_mm,folder\n1000,80.5,2,b\n50,{auc},1,a\n"
     (tmp_path / "summary.csv").write_text(rows)
     found = read_sweep(tmp_path)
     assert find_ties(found) == ties

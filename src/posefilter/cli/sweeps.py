@@ -101,4 +101,6 @@ def list_rows(sweep: "Sweep") -> list[Row]:
 def _cell(value: Any) -> str:
     if value is None:
         return "–"
-    return f"{value:.4g}" if isinstance(value, float) else str(value)
+    if isinstance(value, float):
+        return f"{value:.4g}"
+    return " ".join(str(value).replace("|", r"\|").split())  # which would begin another cell or row

@@ -18,9 +18,16 @@ def score_numbers(numbers: Mapping[str, float], missing: float = 0.0) -> float:
         numbers: As `flatten` returns them.
         missing: What a detector's number that is not there counts as.
     """
-    auc = numbers.get("add_up_to_symmetry/auc", numbers.get("add/auc"))
+    auc = numbers.get(f"{find_error(numbers)}/auc")
     on_object, iou = (numbers.get(name, missing) for name in ("particles_on_object", "iou"))
     return overall(auc, on_object, iou)
+
+
+def find_error(numbers: Mapping[str, float]) -> str:
+    """Return the name of the error that poses are judged by: where it is known, the ADD up to
+    symmetry.
+    """
+    return "add_up_to_symmetry" if "add_up_to_symmetry/auc" in numbers else "add"
 
 
 def flatten(results: Mapping[str, Any], prefix: str = "") -> dict[str, float]:

@@ -8,11 +8,19 @@ from matplotlib.figure import Figure
 
 from posefilter.figures.canvas import create_figure
 from posefilter.metrics.registry import MetricInfo, find_metric
-from posefilter.report.charts import LIGHT, WIDTH_PX, Line, Panel, draw_panel, measure_height
-from posefilter.report.sweeps import Group, Sweep, Value, group_jobs
+from posefilter.report.charts import (
+    LIGHT,
+    WIDTH_PX,
+    Line,
+    Panel,
+    count_columns,
+    draw_panel,
+    measure_height,
+)
+from posefilter.report.sweeps import Group, Sweep, Value, group_jobs, list_judging
 
 MOST_LINES = 6  # values of a second axis that become lines, settings that get a name
-SUMMED = ("add/auc", "iou", "particles_on_object", "seconds_per_image")
+SUMMED = ("iou", "particles_on_object", "seconds_per_image")  # beside what the score is made of
 _TITLE_PX = 60
 
 
@@ -92,8 +100,8 @@ def chart_against_time(found: Sequence[Group]) -> list[Panel]:
     if len(found) < 2:
         return []
     cost = find_metric("seconds_per_image")
-    # what sweeps maximize: the one, or else the other
-    for info in map(find_metric, ("add/auc", "particles_on_object")):
+    # what sweeps maximize; of a detector, the second part of it
+    for info in map(find_metric, list_judging([job for one in found for job in one.jobs])[-1:]):
         lines = [
             Line(spell(one.place), [mean(x)], [mean(info.convert(value) for value in y)])
             for one in found
@@ -118,13 +126,15 @@ def draw_summary(sweep: Sweep) -> Figure | None:
     """
     found = group_jobs(sweep)
     once = len(found) == len(sweep.jobs)
-    infos = [find_metric(key) for key in SUMMED]
+    infos = [find_metric(key) for key in dict.fromkeys((*list_judging(sweep.jobs), *SUMMED))]
     charts = {axis: chart_over(axis, sweep, found, infos) for axis in sweep.shown}
     charts = {axis: row for axis, row in charts.items() if row}
     rows = [[replace(panel, joined=not once) for panel in row] for row in charts.values()]
     if not rows:
         return None
-    heights, columns = [measure_height(row[0]) for row in rows], len(rows[0])
+    columns = len(rows[0])
+    # with room for a legend below each row
+    heights = [measure_height(replace(row[0], joined=False)) for row in rows]
     figure = create_figure(columns * WIDTH_PX, sum(heights) + _TITLE_PX)
     figure.set_layout_engine("constrained")
     count = f"{len(sweep.jobs)} run{'s' * (len(sweep.jobs) != 1)}"
@@ -135,12 +145,15 @@ def draw_summary(sweep: Sweep) -> Figure | None:
             notes = "one seed each: differences may be chance"
     title = f"Sweep over {', '.join(sweep.shown)}: {count}\n{notes}"
     figure.suptitle(title, fontsize=12, fontweight="bold")
-    axes = figure.subplots(len(rows), columns, squeeze=False, height_ratios=heights)
-    for line, row in zip(axes, rows, strict=True):
+    parts = figure.subfigures(len(rows), squeeze=False, height_ratios=heights)[:, 0]
+    for part, row in zip(parts, rows, strict=True):
+        line = part.subplots(1, columns, squeeze=False)[0]
         for own, panel in zip(line, row, strict=True):
             draw_panel(own, panel, LIGHT)
         if row[0].categories:
             line[0].set_ylabel(row[0].xlabel, fontsize=8.5)
         if len(row[0].lines) > 1:
-            line[0].legend(fontsize=8, frameon=False)
+            style = {"fontsize": 8, "frameon": False, "ncols": columns * count_columns(row[0])}
+            handles, labels = line[0].get_legend_handles_labels()
+            part.legend(handles, labels, loc="outside lower left", **style)
     return figure

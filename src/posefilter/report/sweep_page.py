@@ -29,8 +29,10 @@ from posefilter.report.sweeps import (
     Sweep,
     find_best_group,
     find_best_job,
+    find_median,
     find_ties,
     group_jobs,
+    list_judging,
 )  # fmt: skip
 
 
@@ -95,12 +97,14 @@ def name_best(sweep: Sweep, winner: Job) -> list[Cell]:
     found = group_jobs(sweep)
     group = found[find_best_group(found)]
     if sweep.shown and len(group.jobs) > 1:
-        infos = list_metrics(sweep)[:1]
+        infos = map(find_metric, list_judging(group.jobs))
         figures = [f"{info.label} {format_mean(group, info)}" for info in infos]
         why = f"({', '.join([*figures, f'mean of {len(group.jobs)} seeds'])})"
         return [Text(spell(group.place), "code"), Text(why, "soft")]
     tied = find_ties(sweep)
-    ties = f"({tied} runs have its score to one decimal; it has the least median ADD)"
+    median = find_median(winner)
+    why = f"has the least {find_metric(median[0]).label}" if median else "is the first of them"
+    ties = f"({tied} runs have its score to one decimal; it {why})"
     name = Text(spell(winner.place) or winner.folder, "code")
     return [name, Text(ties, "soft")] if tied > 1 else [name]
 

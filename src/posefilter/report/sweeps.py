@@ -14,7 +14,7 @@ from typing import NamedTuple
 from posefilter.errors import UserError
 from posefilter.forms import MOST
 from posefilter.limits import open_text
-from posefilter.metrics.results import score_numbers
+from posefilter.metrics.results import find_error, score_numbers
 from posefilter.report.diagnostics import list_numbers
 from posefilter.report.gather import SWEEP_MARKS, read_json, read_part, read_texts, read_yaml
 from posefilter.report.settings import SILENT, read_typed
@@ -22,8 +22,8 @@ from posefilter.report.settings import SILENT, read_typed
 COLUMNS = {  # of summary.csv, and the metrics that they hold
     key.replace("/", "_"): key
     for key in (
-        "add/auc", "add/recall_01d", "add/median_mm", "add_s/auc", "add_up_to_symmetry/auc", "iou",
-        "particles_on_object", "seconds_per_image",
+        "add/auc", "add/recall_01d", "add/median_mm", "add_s/auc", "add_up_to_symmetry/auc",
+        "add_up_to_symmetry/median_mm", "iou", "particles_on_object", "seconds_per_image",
     )
 }  # fmt: skip
 Value = int | float | str
@@ -195,17 +195,36 @@ def group_jobs(sweep: Sweep) -> list[Group]:
     return list(out.values())
 
 
+def list_judging(jobs: Sequence[Job]) -> list[str]:
+    """Return the metrics that the score of runs is made of: one of poses, or two of detectors."""
+    known = {key for job in jobs for key in job.numbers}
+    kinds = {find_error(job.numbers) for job in jobs if "add/auc" in job.numbers}
+    if kinds:  # plain ADD where a sweep is of several objects, and one has no symmetries
+        return [f"{min(kinds)}/auc"]
+    return [key for key in ("iou", "particles_on_object") if key in known]
+
+
+def find_median(job: Job) -> tuple[str, float] | None:
+    """Return the key and the value of the median error that decides between runs of one score;
+    None where it is infinite, or the run is a detector's.
+    """
+    for error in (find_error(job.numbers), "add"):  # an earlier summary.csv has only the latter
+        if (key := f"{error}/median_mm") in job.numbers:
+            return key, job.numbers[key]
+    return None
+
+
 def rank(jobs: Sequence[Job]) -> tuple[float, float]:
     """Return what the best of all has most of: the mean score to one decimal, then (where it ties)
-    the least median ADD.
+    the least median error, up to symmetry where it is known.
     """
-    medians = [job.numbers.get("add/median_mm", math.inf) for job in jobs]
+    medians = [median[1] if (median := find_median(job)) else math.inf for job in jobs]
     return round(mean(score_numbers(job.numbers, -math.inf) for job in jobs), 1), -mean(medians)
 
 
 def find_best_job(sweep: Sweep) -> Job:
     """Return the run with the highest score, of those with the best setting: one lucky seed makes
-    no setting the best. Of those that tie, the one with the least median ADD.
+    no setting the best. Of those that tie, the one with the least median error.
 
     Raises UserError where every run has failed.
     """
@@ -223,7 +242,7 @@ def find_ties(sweep: Sweep) -> int:
 
 def find_best_group(found: Sequence[Group]) -> int:
     """Return which group has the highest mean score; of those that tie, the one with the least
-    median ADD.
+    median error.
     """
     ranks = [rank(group.jobs) for group in found]
     return ranks.index(max(ranks))
