@@ -28,7 +28,6 @@ from posefilter.report.image_errors import (
     chart_errors,
     compute_cdf,
     group_by_visibility,
-    is_found,
     list_worst,
     measure_auc,
 )
@@ -85,7 +84,7 @@ def test_ranges_of_visibility_hold_each_image_once_and_in_order() -> None:
     )
     means = np.array(curve.lines[0].y)
     assert np.average(means, weights=[len(part) for part in parts]) == pytest.approx(
-        100 * np.mean([is_found(row) for row in rows[:50]])
+        100 * np.mean([row.add_mm < 0.1 * row.diameter_mm for row in rows[:50]])
     )
 
 
@@ -175,13 +174,33 @@ def test_instances_of_an_image_are_paired_in_their_order() -> None:
 def test_a_median_that_is_infinite_is_not_like_one_that_is_not() -> None:
     half = [make_row(k, math.inf if k < 6 else 3.0) for k in range(10)]
     found = [make_row(k, 3.0) for k in range(10)]
-    for rows, sign in (({"A": half, "B": found}, "-"), ({"A": found, "B": half}, "+")):
-        cells = {row[0]: row[3] for row in tabulate_common(rows).rows}
-        changed = cells["median ADD"]
-        assert isinstance(changed, Text)
-        assert changed == Text(f"{sign}inf mm", "good" if sign == "-" else "bad")
+    better, worse = ("missed", "3.0 mm", Text("better", "good")), ("3.0 mm", "missed")
+    for rows, cells in (
+        ({"A": half, "B": found}, better),
+        ({"A": found, "B": half}, (*worse, Text("worse", "bad"))),
+    ):
+        (own,) = (row for row in tabulate_common(rows).rows if row[0] == "median ADD")
+        assert (*own[1:],) == cells
     cells = {row[0]: row[3] for row in tabulate_common({"A": half, "B": half}).rows}
     assert cells["median ADD"] == "alike"
+
+
+def test_images_that_one_run_missed_count_in_the_median_change() -> None:
+    """The others alone would have the other sign."""
+    first = [make_row(i, 5.0) for i in range(10)]
+
+    def compare(missed: int, others: float = 4.0) -> str:
+        second = [make_row(i, math.inf if i < missed else others) for i in range(10)]
+        return str(list_verdict(match_images(first, second), ("A", "B"))[0])
+
+    assert "from the first to the second is -1 mm." in compare(4)
+    assert "no median change: B alone misses half of the images or more." in compare(5)
+    assert "no median change: B alone misses half of the images or more." in compare(7)
+    second = [make_row(i, math.inf if i < 3 else 5.0 + i / 10) for i in range(10)]
+    said = str(list_verdict(match_images(first, second), ("A", "B"))[0])
+    assert "from the first to the second is +0.75 mm." in said
+    back = str(list_verdict(match_images(second[:3], first[:3]), ("A", "B"))[0])
+    assert "no median change: A alone misses" in back
 
 
 def test_a_comparison_turned_round_is_the_same(pair: tuple[Path, Path]) -> None:
@@ -211,6 +230,18 @@ def test_a_turn_that_is_a_symmetry_decides_nothing() -> None:
     both = match_images(first, turned)
     assert judge(both)[:3] == (0, 20, 0)
     assert "by ADD up to symmetry" in str(list_verdict(both, ("A", "B")))
+    rows = {"A": first, "B": turned}
+    table = {row[0]: row[1:] for row in tabulate_common(rows).rows}
+    assert next(iter(table)) == "ADD up to symmetry AUC"
+    assert table["median ADD up to symmetry"] == ["5.0 mm", "4.0 mm", Text("-1.0 mm", "good")]
+    cdf = chart_errors(rows)[0]
+    assert cdf.xlabel == "threshold of the ADD up to symmetry [mm]"
+    assert [line.y[-1] for line in cdf.lines] == [100.0, 100.0]
+    assert max(cdf.lines[1].x[:-1]) == 4.0
+    own, auc, recall = chart_errors({"": turned})
+    assert [line.label for line in own.lines] == ["ADD up to symmetry", "ADD", "ADD-S"]
+    assert auc.title == "ADD up to symmetry AUC by visibility"
+    assert set(recall.lines[0].y) == {100.0}
     earlier = match_images([make_row(i, 5.0) for i in range(20)], turned)
     assert judge(earlier)[:3] == (20, 0, 0)
     assert "by ADD:" in str(list_verdict(earlier, ("A", "B")))

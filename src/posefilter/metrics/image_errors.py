@@ -86,9 +86,13 @@ def parse_row(row: dict[str, str]) -> ImageError:
     return error
 
 
-def summarize_images(rows: Sequence[ImageError]) -> dict[str, dict[str, float]]:
-    """Return the blocks `add` and `add_s` of metrics.json for a set of images."""
+def summarize_images(
+    rows: Sequence[ImageError], symmetric: bool = False
+) -> dict[str, dict[str, float]]:
+    """Return the blocks `add` and `add_s` of metrics.json for a set of images, and if asked
+    `add_up_to_symmetry`, which all of them must know.
+    """
     names = [f"{name}_mm" for name in InstanceErrors._fields]
     columns = [[getattr(row, name) for row in rows] for name in names]
     errors = InstanceErrors(*torch.tensor(columns, dtype=torch.float64) / 1000)
-    return summarize_errors(errors, symmetric=False)
+    return summarize_errors(errors, symmetric)

@@ -4,7 +4,7 @@ import math
 from collections.abc import Sequence
 from itertools import product
 from pathlib import Path
-from statistics import median
+from statistics import median_high, median_low
 from typing import Any, NamedTuple
 
 from posefilter.errors import UserError
@@ -25,7 +25,7 @@ from posefilter.report.blocks import (
 )
 from posefilter.report.charts import Line, Panel
 from posefilter.report.gather import Run, read_run
-from posefilter.report.image_errors import EQUAL_MM, chart_errors
+from posefilter.report.image_errors import EQUAL_MM, chart_errors, has_symmetries
 from posefilter.report.page import Page
 from posefilter.report.result_tables import compare_numbers
 from posefilter.report.run_page import list_changes
@@ -204,37 +204,58 @@ def list_verdict(pairs: Sequence[Pair], names: tuple[str, str]) -> list[Block]:
         ]
     else:
         words = [Text("No difference that chance would not explain", "soft"), f"({chance})."]
-    finite, middle = [pair.change for pair in pairs if math.isfinite(pair.change)], ""
-    if finite:
-        change = f"{median(finite):+.2g} mm"
-        middle = f"The median change of the error from the first to the second is {change}."
     how = (
         f"Sign test over images, by {name_error(pairs)}: those whose errors differ by less than "
         "0.05 mm do not count."
     )
-    return [Paragraph([*words, middle]), Paragraph([Text(how, "soft")])]
+    return [
+        Paragraph([*words, describe_median_change(pairs, names)]),
+        Paragraph([Text(how, "soft")]),
+    ]
+
+
+def describe_median_change(pairs: Sequence[Pair], names: tuple[str, str]) -> str:
+    """Return the median change of the error in words; an image that one of two missed has an
+    infinite change.
+    """
+    changes = [pair.change for pair in pairs]
+    low, high = median_low(changes), median_high(changes)
+    if math.isfinite(low) and math.isfinite(high):
+        change = f"{(low + high) / 2:+.2g} mm"
+        return f"The median change of the error from the first to the second is {change}."
+    missing = [name for name, end in zip(names, (low, high), strict=True) if math.isinf(end)]
+    if low == high:
+        missing = [names[0] if low < 0 else names[1]]
+    alone = " and as often ".join(f"{name} alone" for name in missing)
+    return f"The error has no median change: {alone} misses half of the images or more."
 
 
 def tabulate_common(rows: dict[str, list[ImageError]]) -> Table:
     """Return the metrics of both runs on the common images, and their difference."""
-    found = [summarize_images(own) for own in rows.values()]
+    symmetric = has_symmetries([row for own in rows.values() for row in own])
+    found = [summarize_images(own, symmetric) for own in rows.values()]
+    kinds = ("add_up_to_symmetry", "add", "add_s") if symmetric else ("add", "add_s")
     cells: list[list[Cell]] = []
-    for kind, name in product(("add", "add_s"), found[0]["add"]):
+    for kind, name in product(kinds, found[0]["add"]):
         info = find_metric(f"{kind}/{name}")
         first, second = (one[kind][name] for one in found)
         change = 0.0 if first == second else second - first  # both may be infinite
         difference: Cell = "alike"
         if f"{abs(change):.1f}" != "0.0":
             style: Style = "good" if change * info.direction > 0 else "bad"
-            difference = Text(f"{change:+.1f} {info.unit}".strip(), style)
-        cells.append([info.label, info.describe(first), info.describe(second), difference])
+            words = f"{change:+.1f} {info.unit}".strip()
+            if math.isinf(change):  # half of the images or more are missed
+                words = "better" if style == "good" else "worse"
+            difference = Text(words, style)
+        both = ("missed" if math.isinf(x) else info.describe(x) for x in (first, second))
+        cells.append([info.label, *both, difference])
     return Table(("", *rows, "change"), cells, numeric=(1, 2, 3), form="narrow")
 
 
 def name_error(pairs: Sequence[Pair]) -> str:
     """Return what the error of images is that are compared."""
-    plain = all(pair.errors == (pair.a.add_mm, pair.b.add_mm) for pair in pairs)
-    return "ADD" if plain else "ADD up to symmetry"
+    symmetric = has_symmetries([row for pair in pairs for row in pair])
+    return "ADD up to symmetry" if symmetric else "ADD"
 
 
 def chart_pairs(pairs: Sequence[Pair], names: tuple[str, str]) -> list[Panel]:

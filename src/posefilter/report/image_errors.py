@@ -11,7 +11,7 @@ import torch
 
 from posefilter.errors import UserError
 from posefilter.figures.layout import format_length
-from posefilter.metrics.image_errors import FILE, ImageError, read_errors
+from posefilter.metrics.image_errors import FILE, ImageError, read_errors, summarize_images
 from posefilter.metrics.registry import PERCENT, find_metric
 from posefilter.metrics.scores import auc
 from posefilter.report.blocks import Block, Cell, Fold, Heading, Paragraph, Table, Text, draw_charts
@@ -73,29 +73,41 @@ def chart_errors(runs: Mapping[str, Sequence[ImageError]]) -> list[Panel]:
     is not shown.
     """
     posed = {n for n, rows in runs.items() if any(math.isfinite(r.diameter_mm) for r in rows)}
-    runs = {name: rows for name, rows in runs.items() if name in posed}
-    cdf, by_share, by_auc = list[Line](), list[Line](), list[Line]()
+    runs = {
+        name: [row for row in rows if not math.isnan(row.add_mm)]
+        for name, rows in runs.items()
+        if name in posed
+    }
+    alone = len(runs) == 1
+    symmetric = has_symmetries([row for rows in runs.values() for row in rows])
+    error = "add_up_to_symmetry" if symmetric else "add"
+    kinds = {"ADD up to symmetry": "add_up_to_symmetry_mm"} if symmetric else {}
+    kinds |= {"ADD": "add_mm", "ADD-S": "add_s_mm"}
+    kind = next(iter(kinds))
+    cdf = list[Line]()
+    by_visibility: dict[str, list[Line]] = {"auc": [], "recall_01d": []}
     for name, rows in runs.items():
-        alone = len(runs) == 1
-        cdf.append(Line("ADD" if alone else name, *compute_cdf([row.add_mm for row in rows])))
-        if alone:
-            cdf.append(Line("ADD-S", *compute_cdf([row.add_s_mm for row in rows])))
+        for label, column in kinds.items() if alone else [(name, kinds[kind])]:
+            cdf.append(Line(label, *compute_cdf([getattr(row, column) for row in rows])))
         parts = group_by_visibility(rows)
         seen = [float(np.mean([row.visibility for row in part])) for part in parts]
-        if parts:
-            found = [100 * float(np.mean([is_found(row) for row in part])) for part in parts]
-            by_share.append(Line(name, seen, found))
-            by_auc.append(Line(name, seen, [measure_auc(part) for part in parts]))
-    out = [Panel("Images with an error below a threshold", "threshold [mm]", "%", cdf, PERCENT)]
-    for lines, key in ((by_auc, "add/auc"), (by_share, "add/recall_01d")):
-        info = find_metric(key)
+        found = [summarize_images(part, symmetric)[error] for part in parts]
+        for key, lines in by_visibility.items():
+            lines += [Line(name, seen, [one[key] for one in found])] if parts else []
+    threshold = f"threshold of the {kind} [mm]" if symmetric and not alone else "threshold [mm]"
+    out = [Panel("Images with an error below a threshold", threshold, "%", cdf, PERCENT)]
+    for key, lines in by_visibility.items():
+        info = find_metric(f"{error}/{key}")
         out.append(Panel(f"{info.label} by visibility", "visible share", info.unit, lines, PERCENT))
     return [panel for panel in out if panel.lines]
 
 
-def is_found(row: ImageError) -> bool:
-    """Tell whether an object was found: its ADD is below a tenth of its diameter."""
-    return row.add_mm < 0.1 * row.diameter_mm
+def has_symmetries(rows: Sequence[ImageError]) -> bool:
+    """Tell whether objects have symmetries that count: all errors up to symmetry are known, and
+    some are less than the ADD.
+    """
+    known = not any(math.isnan(row.add_up_to_symmetry_mm) for row in rows)
+    return known and any(row.add_up_to_symmetry_mm < row.add_mm - EQUAL_MM for row in rows)
 
 
 def measure_auc(rows: Sequence[ImageError]) -> float:
@@ -116,7 +128,7 @@ def list_worst(rows: Sequence[ImageError]) -> list[Block]:
     """Return the images with the greatest errors, by name."""
     posed = [row for row in rows if not math.isnan(row.add_mm)]
     worst = sorted(posed, key=lambda row: -row.error_mm)[:LISTED]
-    symmetric = any(row.error_mm < row.add_mm - EQUAL_MM for row in posed)
+    symmetric = has_symmetries(posed)
     worst = worst or sorted(rows, key=lambda row: row.particles_on_object)[:LISTED]
     cells: list[list[Cell]] = [
         [
