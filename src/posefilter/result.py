@@ -25,7 +25,7 @@ from posefilter.confidence.verdicts import (
 )
 from posefilter.errors import UserError
 from posefilter.models.base import PoseEstimator
-from posefilter.plausibility import find_warnings
+from posefilter.plausibility import find_input_warnings, find_warnings
 from posefilter.types import Batch, BeliefBatch, ObjectModel, Trace
 
 if TYPE_CHECKING:
@@ -74,6 +74,8 @@ class Result:
             included, whose depth at the pose agrees with the measured one.  Earlier calibrations
             choose the group of a conformal set by it, under the name `surface`.
         instance: Which of its class it is, from 0, the most probable first.
+        input_warnings: Those of `warnings` that do not depend on the pose, which of an absent
+            object says nothing.
         mask: The pixels (H, W) bool of the image that are its own, where instances were asked for;
             else None.
     """
@@ -99,6 +101,7 @@ class Result:
     wrong_size: bool = False
     blank: str = ""
     instance: int = 0
+    input_warnings: tuple[str, ...] = ()
     mask: np.ndarray | None = None
 
     def __repr__(self) -> str:
@@ -290,7 +293,9 @@ class Result:
             torch.from_numpy(self.pose),
             torch.tensor(self.score),
         )
-        return draw_belief(rgb, intrinsics, tensors, self.object_model, draws=self.belief.draws)
+        title = f"Belief\n{self.describe()}"
+        draws = self.belief.draws
+        return draw_belief(rgb, intrinsics, tensors, self.object_model, title=title, draws=draws)
 
     def draw_band(
         self, rgb: Any, intrinsics: Any, shape: "Shape | None" = None, level: float = 0.95
@@ -367,7 +372,8 @@ def make_result(
         run.batch.depth[image, 0].cpu().numpy(),
         run.batch.intrinsics[image].double().cpu().numpy(),
     )
-    warnings = find_warnings(pose, object_model, depth, K, size if wrong_size else None)
+    seen = size if wrong_size else None
+    doubts = (blank,) if blank else ()
     return Result(
         object=object_model.name,
         pose=pose,
@@ -375,7 +381,8 @@ def make_result(
         probability=None if found is None else float(found.probability[image]),
         presence=None if found is None else float(found.presence[image]),
         belief=make_belief(belief, image, object_model, run.draws),
-        warnings=(blank, *warnings) if blank else warnings,
+        warnings=(*doubts, *find_warnings(pose, object_model, depth, K, seen)),
+        input_warnings=(*doubts, *find_input_warnings(depth, K, seen)),
         seconds=run.seconds,
         object_model=object_model,
         costs=costs or Costs(),

@@ -23,7 +23,7 @@ from posefilter.meshes import ycb
 from posefilter.meshes.mesh import object_model
 from posefilter.meshes.store import MeshStore
 from posefilter.metrics.bop_results import read_poses_csv
-from posefilter.plausibility import find_warnings
+from posefilter.plausibility import find_input_warnings, find_warnings
 
 NAME = "003_cracker_box"
 NATIVE = ycb.ycbvideo_from_original(NAME)
@@ -385,6 +385,23 @@ def test_a_median_depth_beyond_what_cameras_measure_is_told():
     for median, told in ((8.0, True), (3.0, False)):
         found = find_warnings(where, model, np.full((100, 100), median), K)
         assert any(f"the median depth is {median:.2g} m, farther" in one for one in found) is told
+
+
+def test_what_makes_the_inputs_implausible_does_not_depend_on_the_pose():
+    model = object_model(MeshStore("builtin").load("carton"))
+    depth, camera = np.full((100, 100), 8.0), np.array([[90.0, 0, 50], [0, 90.0, 50], [0, 0, 1]])
+    far, behind = np.eye(4), np.eye(4)
+    far[:3, 3], behind[2, 3] = (5.0, 0.0, 1.0), -1.0
+    inputs = find_input_warnings(depth, camera, 1.25)
+    assert [one.split()[:3] for one in inputs] == [
+        ["the", "median", "depth"],
+        ["the", "object", "appears"],
+    ]
+    for where in (far, behind):
+        found = find_warnings(where, model, depth, camera, 1.25)
+        assert found[:2] == inputs
+        assert len(found) == 3
+    assert not find_input_warnings(np.ones((100, 100)), camera)
 
 
 def test_a_principal_point_of_the_turned_image_is_told():

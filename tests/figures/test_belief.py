@@ -263,6 +263,19 @@ def test_a_second_pose_is_reported_with_its_share() -> None:
     assert re.fullmatch(r"second pose 30 %: [\d.]+ mm and \d+° off", other)
 
 
+def test_a_second_pose_that_outweighs_the_estimate_is_not_taken_for_it() -> None:
+    """The width is that of the heaviest mode, and the sentence says whose it is."""
+    belief, _, _ = two_modes(share=0.7)
+    poses, weights, best = select_single(belief)
+    found = summarize_belief(poses, weights, best, model())
+    assert found.share == pytest.approx(0.3, abs=0.01)
+    assert re.fullmatch(
+        r"the estimate has 30 % of the belief; another pose has 70 %, "
+        r"within 1\d\.\d mm and [45]\.\d degrees \(95 %\)",
+        describe_belief(found)[0],
+    )
+
+
 def test_an_equivalent_pose_is_no_second_one() -> None:
     best = looking(0.3, 0.4)
     center = model().center.double()

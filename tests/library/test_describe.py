@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from posefilter.cli.predict import mark_result
+from posefilter.cli.predict import mark_result, print_result
 from posefilter.confidence.tolerance import PoseTolerance
 from posefilter.result import Result
 
@@ -70,3 +70,45 @@ def test_among_several_the_probability_is_that_of_the_tolerance_that_was_given()
 def test_a_wrong_size_is_told_where_it_makes_unsure(verdict: str) -> None:
     said = Result.describe(answer(verdict, wrong_size=True, apparent_size=1.25))  # type: ignore[arg-type]
     assert ("appears 1.25 times its size" in said) == (verdict == "unsure")
+
+
+@pytest.mark.parametrize(
+    ("verdict", "told"), [("found", ["size", "outside"]), ("absent", ["size"])]
+)
+def test_the_pose_of_what_is_absent_raises_no_doubts(
+    verdict: str, told: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    """They would blame intrinsics that are right."""
+    one = answer(
+        verdict,
+        pose=np.eye(4),
+        seconds=0.5,
+        describe=lambda: "box",
+        calibration=None,
+        belief_calibrated=True,
+        belief=SimpleNamespace(uncertainty=lambda: SimpleNamespace(describe=lambda: "within 1 mm")),
+        warnings=("size", "outside"),
+        input_warnings=("size",),
+    )
+    print_result(one)  # type: ignore[arg-type]
+    lines = capsys.readouterr().out.splitlines()
+    assert [line for line in lines if line.startswith("warning")] == [
+        f"warning: {one}" for one in told
+    ]
+
+
+def test_the_picture_of_a_belief_has_the_verdict(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It shows a pose, also of what is absent."""
+    titles: list[str] = []
+    monkeypatch.setattr(
+        "posefilter.figures.belief.draw_belief", lambda *_, title, **__: titles.append(title)
+    )
+    one = answer(
+        "absent",
+        pose=np.eye(4),
+        belief=SimpleNamespace(samples=np.eye(4)[None], weights=np.ones(1), draws=0),
+        object_model=None,
+        describe=lambda: Result.describe(one),  # type: ignore[arg-type]
+    )
+    Result.draw_belief(one, None, None)  # type: ignore[arg-type]
+    assert titles == ["Belief\nbox: absent, probability 0.95 that it is there"]

@@ -234,7 +234,9 @@ def print_result(result: Result) -> None:
     if result.verdict != "absent":
         said = "if it is right" if result.belief_calibrated else "the particles"
         print(f"{said}: {result.belief.uncertainty().describe()}")
-    for warning in result.warnings:
+    # the pose of an object that is absent says nothing about the camera
+    absent = result.verdict == "absent"
+    for warning in result.input_warnings if absent else result.warnings:
         print(f"warning: {warning}")
 
 

@@ -10,6 +10,7 @@ Above it is said in words how sure the belief is, and which other pose it holds 
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -244,6 +245,7 @@ class BeliefSummary(NamedTuple):
     second: Hypothesis | None  # the heaviest of the other modes, if one counts
     second_translation: float  # how far its center is from the estimate's [m]
     second_rotation: float  # by how much it is turned from the estimate [rad]
+    is_outweighed: bool = False  # whether the second is heavier, and the uncertainty about it
 
 
 def summarize_belief(
@@ -271,7 +273,9 @@ def summarize_belief(
         other = torch.from_numpy(second.pose).to(best)
         away = float((origin_of(other, center) - origin_of(best, center)).norm())
         turned = float(angle_between(rotation_of(other), rotation_of(best)))
-    return BeliefSummary(whole.uncertainty(), found.estimate.weight, second, away, turned)
+    share = found.estimate.weight
+    outweighed = not draws and second is not None and second.weight > share
+    return BeliefSummary(whole.uncertainty(), share, second, away, turned, outweighed)
 
 
 def describe_belief(summary: BeliefSummary) -> tuple[str, str]:
@@ -279,6 +283,10 @@ def describe_belief(summary: BeliefSummary) -> tuple[str, str]:
     sure = summary.uncertainty.describe()
     if summary.share == 0:
         sure = f"the estimate lies apart from the particles, which are {sure}"
+    elif summary.is_outweighed and summary.second is not None:
+        width = replace(summary.uncertainty, mass=1.0).describe()
+        own, other = (f"{100 * x:.0f} %" for x in (summary.share, summary.second.weight))
+        sure = f"the estimate has {own} of the belief; another pose has {other}, {width}"
     if summary.second is None:
         return sure, "no second pose above 1 %"
     away, turned = format_length(summary.second_translation), math.degrees(summary.second_rotation)
