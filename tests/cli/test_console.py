@@ -48,6 +48,26 @@ def test_bars_are_for_terminals(
     assert isinstance(progress("json"), Lines)
 
 
+def test_a_bar_goes_on_where_nothing_is_logged() -> None:
+    bars = Bars()
+    trainer: Any = SimpleNamespace(
+        global_step=1,
+        max_steps=4,
+        estimated_stepping_batches=4,
+        callback_metrics=METRICS,
+        log_every_n_steps=0,
+    )
+    module: Any = SimpleNamespace()
+    bars.on_train_start(trainer, module)
+    try:
+        for trainer.global_step, said in ((2, ""), (4, briefly(METRICS))):
+            bars.on_train_batch_end(trainer, module)
+            (task,) = bars._shown().tasks
+            assert (task.completed, task.fields["said"]) == (trainer.global_step, said)
+    finally:
+        bars.teardown()
+
+
 def test_a_long_training_prints_its_progress(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -369,6 +369,22 @@ def test_a_scene_of_a_dataset_is_tracked_with_its_errors(tmp_path: Path) -> None
     assert (tmp_path / "video.gif").stat().st_size > 1000
 
 
+def test_a_video_of_which_no_frame_was_read_is_not_listed(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    root, out = tmp_path / "data", tmp_path / "out"
+    for name in (SCENE.name, "scene0004_0"):
+        shutil.copytree(SCENE.with_name(name), root / SCENE.parent.name / name)
+    (image,) = (root / SCENE.parent.name / "scene0004_0").glob("*.left.jpg")
+    image.write_bytes(b"")
+    typed = [*COMMON, "data=fat", f"data.root={root}", "save_video=gif", "on_error=skip"]
+    assert run_command("track", HOME, [*typed, f"out={out}"]) == 0
+    (line,) = [one for one in capfd.readouterr().out.splitlines() if '"tracked"' in one]
+    files = json.loads(line)["files"]
+    assert [name for name in files if name.startswith("video")] == [f"video_{SCENE.name}"]
+    assert all(Path(file).is_file() for file in files.values())
+
+
 @pytest.mark.parametrize(
     ("wrong", "told"),
     [

@@ -143,7 +143,8 @@ class Bars(Callback):
             return
         said: dict[str, Any] = {}
         every: int = trainer.log_every_n_steps  # type: ignore[attr-defined]
-        if trainer.global_step % every == 0 or trainer.global_step == trainer.max_steps:
+        logged = every > 0 and trainer.global_step % every == 0
+        if logged or trainer.global_step == trainer.max_steps:
             said = {"said": briefly(trainer.callback_metrics)}
         step = trainer.global_step
         if self._steps is not None:

@@ -86,7 +86,7 @@ def track(job: Job) -> None:
             broken = error
         if view is not None:
             files[view.stem] = view
-        if cfg.save_video != "none":
+        if writer.path.is_file():  # some frame of it was read
             files[name] = writer.path
         if broken is not None:
             break
