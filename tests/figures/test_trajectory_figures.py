@@ -1,8 +1,11 @@
 """Trajectories and glimpses: lines end where particles end, frames tell who is on the object."""
 
-import numpy as np
+from typing import Any
 
-from posefilter.figures.layout import draw_legend
+import numpy as np
+import pytest
+
+from posefilter.figures.layout import draw_legend, draw_text
 from posefilter.figures.trajectories import (
     OFF,
     ON,
@@ -69,3 +72,20 @@ def test_glimpses_are_shown_whole_and_framed_by_where_they_were() -> None:
 def test_enlarging_repeats_samples() -> None:
     patch = np.arange(4, dtype=np.uint8).reshape(2, 2, 1).repeat(3, 2)
     assert enlarge(patch, 6)[..., 0].tolist() == [[0, 0, 0, 1, 1, 1]] * 3 + [[2, 2, 2, 3, 3, 3]] * 3
+
+
+def test_the_share_on_the_object_is_of_all_particles(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Not of those that are drawn, which are evenly chosen."""
+    notes: list[str] = []
+
+    def note(text: str, *rest: Any, **more: Any) -> np.ndarray:
+        notes.append(text)
+        return draw_text(text, *rest, **more)
+
+    monkeypatch.setattr("posefilter.figures.trajectories.draw_text", note)
+    states = np.concatenate([STATES[:, [0] * 100], STATES[:, [1] * 300]], axis=1)
+    picture = draw_trajectories(RGB, MASK, states, "trajectories")
+    assert "5 steps: 25% end on the object" in notes
+    above_legend = slice(0, len(picture) - len(draw_legend([("start", START)])))
+    for color in (ON, OFF):
+        assert len(places(picture, color, above_legend))

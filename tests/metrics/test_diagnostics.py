@@ -5,11 +5,11 @@ import math
 import pytest
 import torch
 
+from posefilter.geometry.lookup import is_off_frame
 from posefilter.metrics.diagnostics import (
     FilterDiagnostics,
     auroc,
     distinct,
-    is_off_frame,
     line_share,
     near_edge,
     offset_cosine,

@@ -10,6 +10,7 @@ from tests.models.toy import scenes, square
 
 from posefilter.confidence.tolerance import measure_pose_errors
 from posefilter.errors import UserError
+from posefilter.geometry.lookup import is_off_frame
 from posefilter.geometry.pose import make_pose, origin_of, pose_about, rotation_of, transform
 from posefilter.geometry.rotation import exp_so3, random_rotation
 from posefilter.geometry.spaces import PoseSpace
@@ -28,7 +29,6 @@ from posefilter.metrics.confidence import calibration_error, error_at_coverage, 
 from posefilter.metrics.diagnostics import (
     auroc,
     distinct,
-    is_off_frame,
     line_share,
     near_edge,
     offset_cosine,

@@ -4,10 +4,21 @@ from io import BytesIO
 
 import numpy as np
 import pytest
+from matplotlib.colors import to_hex
+from matplotlib.figure import Figure
 from PIL import Image
 
 from posefilter.report.blocks import name_chart
-from posefilter.report.charts import LIGHT, Line, Panel, distinguish, draw_chart
+from posefilter.report.charts import (
+    DARK,
+    LIGHT,
+    Line,
+    Panel,
+    Theme,
+    distinguish,
+    draw_chart,
+    draw_panel,
+)
 
 
 @pytest.mark.parametrize("label", ["run {}", "model=patch_pf variant=working seed={}"])
@@ -57,3 +68,21 @@ def test_a_charts_file_has_a_name_that_file_systems_take() -> None:
     assert names[0] != names[1]
     assert max(len(name.encode()) for name in names) < 200
     assert name_chart(Panel("ADD AUC", "steps", "%", [])) == "add-auc-steps"
+
+
+@pytest.mark.parametrize("theme", [LIGHT, DARK])
+def test_the_small_ticks_of_a_logarithmic_axis_are_plain_numbers_in_the_pages_ink(
+    theme: Theme,
+) -> None:
+    """An axis of less than a power of ten has no others."""
+    figure = Figure()
+    axes = figure.subplots()
+    line = Line("an image", [2.5, 7.0], [300.0, 900.0])
+    panel = Panel("ADD", "ADD [mm]", "mm", [line], joined=False, log_x=True, log_y=True)
+    draw_panel(axes, panel, theme)
+    figure.canvas.draw()
+    for axis, expected in ((axes.xaxis, "3"), (axes.yaxis, "400")):
+        labels = [label for label in axis.get_minorticklabels() if label.get_text()]
+        assert expected in [label.get_text() for label in labels]
+        assert all("10^" not in label.get_text() for label in labels)
+        assert {to_hex(label.get_color()) for label in labels} == {theme.ink}

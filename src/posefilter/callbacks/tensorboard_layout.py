@@ -34,7 +34,8 @@ Setting = bool | int | float | str
 # method does not log, its charts leave out.
 LAYOUT: dict[str, dict[str, list[str]]] = {
     "1  Does it work?": {
-        "score on validation (ADD AUC, or mean of box IoU and particles on the object)":
+        "score on validation (ADD AUC, up to the object's symmetries; of detectors, mean of box "
+        "IoU and particles on the object)":
             ["val/score$"],
         "AUC of ADD and ADD-S": [r"val/add/auc$", r"val/add_s/auc$"],
         "median error [mm]": [r"val/add/median_mm$", r"val/add_s/median_mm$"],
@@ -101,8 +102,8 @@ class TensorBoardLayout(Callback):
         self.settings: dict[str, Setting] = {}
         self.swept: tuple[str, ...] = ()
         self._best = float("-inf")
-
         self._written = False
+
     def state_dict(self) -> dict[str, Any]:
         """Return what a resumed run goes on with."""
         return {"best": self._best}
@@ -111,7 +112,6 @@ class TensorBoardLayout(Callback):
         """Go on with the best score of the run that is resumed."""
         self._best = float(state_dict["best"])
 
-    def on_fit_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
     def setup(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
         """Write layout and settings of a run that is only tested, as a sweep's job may be: before
         Lightning writes hparams.yaml.
@@ -119,12 +119,13 @@ class TensorBoardLayout(Callback):
         if stage == "test" and not self._written:
             self._write(trainer)
 
+    def on_fit_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Write layout and settings."""
-        if not trainer.is_global_zero:
         self._write(trainer)
 
     def _write(self, trainer: Trainer) -> None:
         self._written = True
+        if not trainer.is_global_zero:
             return
         for board in get_boards(trainer):
             board.hparams.update(self.settings)  # which Lightning writes to hparams.yaml

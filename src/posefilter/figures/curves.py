@@ -52,12 +52,12 @@ def draw_health(
 def draw_shares(
     curves: Mapping[str, tuple[Sequence[float], Color]], title: str, foot: str
 ) -> np.ndarray:
-    """Draw shares of the particles over the iterations, in percent, in one panel.  curves: numbers
-    in [0, 1], a color.
+    """Draw shares of the particles, or of their variance, over the iterations, in percent, in one
+    panel.  curves: numbers in [0, 1], a color.
     """
     count = max(len(values) for values, _ in curves.values())
     lines = [(100 * np.asarray(values, float), color) for values, color in curves.values()]
-    y = Axis("share of the particles [%]", -2, 102, (0, 25, 50, 75, 100))
+    y = Axis("share of particles or variance [%]", -2, 102, (0, 25, 50, 75, 100))
     panel = draw_curve_panel(
         lines, np.arange(count, dtype=float), make_iteration_axis(count), y, WIDTH, 380, thick=4
     )

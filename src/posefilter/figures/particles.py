@@ -30,6 +30,7 @@ from posefilter.figures.layout import (
 )
 from posefilter.figures.overlay import list_axes
 from posefilter.geometry.camera import project
+from posefilter.geometry.lookup import is_off_frame
 from posefilter.geometry.pose import origin_of
 from posefilter.geometry.spaces import PoseSpace
 from posefilter.protocols import Space
@@ -154,7 +155,7 @@ def draw_iterations(
 
 def measure_off_frame(pixels: np.ndarray, height: int, width: int) -> float:
     """Return the share of places (N, 2) [px] that lie beyond the frame's edges."""
-    return float(((pixels < -0.5) | (pixels > [width - 0.5, height - 0.5])).any(1).mean())
+    return float(is_off_frame(torch.from_numpy(pixels), width, height).double().mean())
 
 
 def describe_step(trace: Trace, number: int, unit: str) -> str:

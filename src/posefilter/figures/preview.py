@@ -9,7 +9,8 @@ from matplotlib import colormaps
 from posefilter.data.frames import Sample
 from posefilter.data.readers.base import BaseReader
 from posefilter.errors import BadData
-from posefilter.figures.canvas import PAPER, TRUTH, arrange_grid, draw_row, full_view, load_font
+from posefilter.figures.canvas import PAPER, TRUTH, arrange_grid, draw_row, full_view
+from posefilter.figures.layout import DETAIL, draw_legend, draw_scale
 from posefilter.figures.overlay import trace_outline
 
 _TILE = 320  # [px]
@@ -63,12 +64,7 @@ def draw_frame(sample: Sample, name: str, near: float, far: float) -> np.ndarray
 
 def draw_depth_scale(width: int, near: float, far: float) -> np.ndarray:
     """Return a row that explains the colors of the depth."""
-    text, bar, size = f"depth: {near:.2f} m", 160, 15
-    left = int(18 + load_font(size).getlength(text))
-    figure = draw_row(width, f"{text}{' ' * 48}", [("unknown", _UNKNOWN)], size).copy()
-    figure[6:-6, left : left + bar] = (_DEPTH(np.linspace(0, 1, bar))[None, :, :3] * 255).astype(
-        np.uint8
-    )
-    end = draw_row(90, f"{far:.2f} m", size=size)
-    figure[:, left + bar : left + bar + 90] = end
-    return figure
+    ramp = (_DEPTH(np.linspace(0, 1, 256))[:, :3] * 255).astype(np.uint8)
+    scale = draw_scale(f"depth: {near:.2f} m", ramp, f"{far:.2f} m", _TILE, DETAIL)
+    legend = draw_legend([("unknown", _UNKNOWN)], width - _TILE, DETAIL)
+    return np.concatenate([scale, legend], axis=1)

@@ -13,7 +13,7 @@ from posefilter.figures.layout import CAPTION, DETAIL, WIDTH, compose_figure, dr
 from posefilter.figures.overlay import trace_outline
 from posefilter.figures.panels import arrange_row
 from posefilter.figures.particles import choose_by_weight, choose_steps, normalize_weights
-from posefilter.geometry.lookup import overlaps_mask
+from posefilter.geometry.lookup import is_off_frame, overlaps_mask
 from posefilter.protocols import Encoding, HasImagePatches
 from posefilter.types import Particles, Trace
 
@@ -39,14 +39,14 @@ def draw_trajectories(
     """Draw where particles started (yellow), went (lines) and ended (green: on the object, red: off
     it).
 
-    rgb (H, W, 3) uint8; mask (H, W) bool; states (T, N, 2) [px], of which a hundred are
-    drawn. Half a frame more is shown on each side where a particle has left it.
+    rgb (H, W, 3) uint8; mask (H, W) bool; states (T, N, 2) [px], of which at most a hundred,
+    evenly chosen, are drawn. Half a frame more is shown on each side where a particle has left it.
     """
     H, W = mask.shape
-    path = states[:, :_PARTICLES]
-    on = find_hits(mask, path[-1])
+    hits, drawn = find_hits(mask, states[-1]), choose_steps(states.shape[1], _PARTICLES)
+    path, on = states[:, drawn], hits[drawn]
     view = full_view(H, W, WIDTH)
-    if ((path < -0.5) | (path > [W - 0.5, H - 0.5])).any():
+    if is_off_frame(torch.from_numpy(path), W, H).any():
         view = View(-0.5 - W / 2, -0.5 - H / 2, WIDTH / (2 * W), WIDTH, round(WIDTH * H / W))
     picture = view.show(rgb)
     view.outline(picture, trace_outline(mask), (255, 255, 255), 1)
@@ -55,7 +55,7 @@ def draw_trajectories(
         draw_lines(picture, list(chosen.transpose(1, 0, 2)), color, 1, halo=False)
         draw_dots(picture, chosen[0], START, 2)
         draw_dots(picture, chosen[-1], color, 3.5)
-    note = f"{len(states)} steps: {on.mean():.0%} end on the object"
+    note = f"{len(states)} steps: {hits.mean():.0%} end on the object"
     return compose_figure(
         title, draw_text(note, CAPTION), picture, draw_legend([("start", START), *_ENDS])
     )

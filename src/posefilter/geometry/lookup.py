@@ -28,6 +28,12 @@ def nearest_inside(pixels: Tensor, height: int, width: int) -> Tensor:
     return torch.minimum(nearest_pixel(pixels).clamp_min(0), corner)
 
 
+def is_off_frame(pixels: Tensor, width: int, height: int) -> Tensor:
+    """Return which positions lie beyond the frame's edges.  (*, 2) [px] -> (*) bool."""
+    u, v = pixels.unbind(-1)
+    return (u < -0.5) | (u > width - 0.5) | (v < -0.5) | (v > height - 0.5)
+
+
 def gather_pixels(image: Tensor, index: Tensor) -> Tensor:
     """Gather whole pixels, zero outside the frame.
 

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 from torchmetrics import Metric
 
-from posefilter.geometry.lookup import nearest_mask_pixel, overlaps_mask
+from posefilter.geometry.lookup import is_off_frame, nearest_mask_pixel, overlaps_mask
 from posefilter.metrics.beliefs import on_object
 from posefilter.metrics.collect import concat_state
 from posefilter.types import Batch, Trace
@@ -62,12 +62,6 @@ def auroc(score: Tensor, positive: Tensor) -> Tensor:
     last = counts.cumsum(0).double()
     ranks = (last - (counts.double() - 1) / 2)[inverse]
     return ((ranks[positive].sum() - n * (n + 1) / 2) / (n * m)).float()
-
-
-def is_off_frame(state: Tensor, width: int, height: int) -> Tensor:
-    """Return which particles are off the frame.  (B, N, 2) [px] -> (B, N) bool."""
-    u, v = state.unbind(-1)
-    return (u < -0.5) | (u > width - 0.5) | (v < -0.5) | (v > height - 0.5)
 
 
 def near_edge(state: Tensor, width: int, height: int, share: float = 0.05) -> tuple[Tensor, Tensor]:

@@ -9,8 +9,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.axis import Axis
 from matplotlib.figure import Figure
-from matplotlib.ticker import MaxNLocator, NullLocator
+from matplotlib.ticker import LogFormatter, MaxNLocator, NullLocator
 from PIL import Image
 
 from posefilter.figures.canvas import create_figure, rasterize
@@ -161,7 +162,9 @@ def style_axes(axes: Axes, panel: Panel, theme: Theme) -> None:
     axes.set_facecolor(theme.paper)
     title = f"{panel.title} [{panel.unit}]" if panel.unit else panel.title
     axes.set_title(title, fontsize=10, color=theme.ink, loc="left", fontweight="bold")
-    axes.tick_params(colors=theme.soft, labelcolor=theme.ink, labelsize=8.5, length=3)
+    for which in ("major", "minor"):  # of log axes, the latter have labels too
+        axes.tick_params(which=which, colors=theme.soft, labelcolor=theme.ink, labelsize=8.5)
+    axes.tick_params(length=3)
     axes.grid(color=theme.soft, alpha=0.25, linewidth=0.6)
     axes.spines[["top", "right"]].set_visible(False)
     axes.spines[["left", "bottom"]].set_color(theme.soft)
@@ -175,10 +178,10 @@ def style_axes(axes: Axes, panel: Panel, theme: Theme) -> None:
         axes.set_xlabel(panel.xlabel, fontsize=8.5, color=theme.ink)
         if panel.log_x:
             axes.set_xscale("log")
-            axes.xaxis.set_major_formatter("{x:g}")
+            write_plainly(axes.xaxis)
         if panel.log_y:
             axes.set_yscale("log")
-            axes.yaxis.set_major_formatter("{x:g}")
+            write_plainly(axes.yaxis)
         ticks = sorted(set(panel.ticks))
         if 0 < len(ticks) <= MOST_TICKS:
             axes.set_xticks(ticks, [f"{x:g}" for x in ticks])
@@ -190,6 +193,22 @@ def style_axes(axes: Axes, panel: Panel, theme: Theme) -> None:
             axes.set_ylim(*panel.limits)
         if panel.diagonal:
             axes.plot(panel.diagonal, panel.diagonal, "-", color=theme.soft, linewidth=1, zorder=1)
+
+
+class PlainNumbers(LogFormatter):
+    """Numbers of a logarithmic axis as they are, `30` and not `3e1`; minor ones where few powers of
+    ten are on the axis.
+    """
+
+    def __call__(self, x: float, pos: int | None = None) -> str:
+        """Return a tick's label, empty where it has none."""
+        return f"{x:g}" if super().__call__(x, pos) else ""
+
+
+def write_plainly(axis: Axis) -> None:
+    """Have the ticks of a logarithmic axis be plain numbers."""
+    axis.set_major_formatter("{x:g}")
+    axis.set_minor_formatter(PlainNumbers())
 
 
 def smooth(values: Sequence[float]) -> np.ndarray:

@@ -4,10 +4,10 @@ import json
 from collections.abc import Iterable, Mapping
 from typing import Any, NamedTuple
 
-# where and how a run was made, not what it was
 # by whose change nothing else comes out
 HANDS = ("out", "console", "tags", "threads", "data.workers", "data.generate.workers")
 SILENT = (*HANDS, "resume", "plugins")  # that set no job of a sweep apart
+# where and how a run was made, not what it was
 PASSING = ("out", "folder", "console", "threads", "resume", "debug", "plugins")
 
 
