@@ -3,6 +3,7 @@ left is the time of the stages that are not done.
 """
 
 import json
+import shlex
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
@@ -272,6 +273,21 @@ def test_other_symmetries_are_refused_before_they_replace_those_of_the_training(
     assert file.read_text() == before
     assert run_command("onboard", arguments=typed) == 2
     assert capfd.readouterr().err.splitlines()[-1].endswith("stopped here")
+
+
+def test_symmetries_of_a_folder_with_a_space_are_advised_as_they_are_typed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    file = tmp_path / "my objects" / "symmetries.json"
+    monkeypatch.setattr(command, "find_and_draw", lambda *given: "no symmetries")
+    monkeypatch.setattr(command, "find_declared", lambda *given: (file, 2))
+    cfg = OmegaConf.create(
+        {"mesh": "a.obj", "mesh_scale": None, "symmetries": "auto", "console": "plain"}
+    )
+    work = Onboarding(cfg, build(names()[0]), tmp_path, Stages(tmp_path / "record.json"))
+    command.use_symmetries(work)
+    words = shlex.split(capfd.readouterr().out.partition("declares 2: ")[2].replace(")", ""))
+    assert words[0] == f"symmetries={file}"
 
 
 def test_a_training_that_was_refused_before_it_began_may_have_other_settings(

@@ -19,6 +19,7 @@ from posefilter.cli.onboarded_mesh import (
 from posefilter.errors import UserError
 from posefilter.meshes.builtin import catalog
 from posefilter.meshes.mesh import Mesh, diameter
+from posefilter.meshes.rotational_symmetries import RotationalSymmetry
 from posefilter.meshes.store import MeshStore
 from posefilter.meshes.write import write_obj
 
@@ -86,6 +87,20 @@ def test_given_symmetries_beat_those_that_are_found(
         find_and_draw(mesh, str(file), 0.001, tmp_path)
     with pytest.raises(UserError, match=r"symmetries=nowhere: no such file; or choose auto"):
         find_and_draw(mesh, "nowhere", None, tmp_path)
+
+
+def test_a_turn_that_fits_no_group_is_not_listed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Turns by a half, a third and a fifth about one axis make turns that are too small."""
+    turns = [
+        RotationalSymmetry(np.eye(3)[2], np.zeros(3), fold, 0.0, 0.0, 0.0, True, True)
+        for fold in (2, 3, 5)
+    ]
+    monkeypatch.setattr(onboarded_mesh, "find_symmetries", lambda mesh: turns)
+    found = find_and_draw(catalog.build("brick"), "geometry", None, tmp_path)
+    z = "about (0.00, 0.00, 1.00)"
+    assert found == f"half turn {z}, third of a turn {z}"
 
 
 def test_a_mesh_too_small_for_a_hull_is_refused(tmp_path: Path) -> None:

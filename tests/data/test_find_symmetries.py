@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 import trimesh
 
-from posefilter.figures.symmetries import draw_symmetries
+from posefilter.figures.symmetries import describe_turn, draw_symmetries, is_in_use
 from posefilter.meshes.builtin import catalog
-from posefilter.meshes.find_symmetries import find_symmetries
+from posefilter.meshes.find_symmetries import FOLDS, find_symmetries
 from posefilter.meshes.mesh import Mesh, diameter
 from posefilter.meshes.rotational_symmetries import (
     ANY,
@@ -135,6 +135,41 @@ def test_a_badly_measured_axis_costs_none_of_the_others() -> None:
     assert len(group) == 8
     for product in (a @ b for a in group for b in group):
         assert distance_to(group, product) < 1e-9
+
+
+def test_every_fold_that_is_tried_has_a_description() -> None:
+    turns = [
+        RotationalSymmetry(np.eye(3)[2], np.zeros(3), fold, 0.0, 0.0, 0.0, True, True)
+        for fold in (ANY, *FOLDS)
+    ]
+    words = [describe_turn(turn) for turn in turns]
+    assert len(set(words)) == len(turns)
+    assert words[-1] == "fifth of a turn about (0.00, 0.00, 1.00)"
+
+
+def test_every_turn_of_a_ball_is_in_use() -> None:
+    """Its symmetries are rotations that are evenly spread, up to some 30 degrees apart."""
+    rng = np.random.default_rng(0)
+    axes = [axis / np.linalg.norm(axis) for axis in rng.standard_normal((40, 3))]
+    turns = [
+        RotationalSymmetry(axis, np.zeros(3), fold, 0.0, 0.0, 0.0, True, True)
+        for axis, fold in zip(axes, [ANY, *FOLDS] * 8, strict=True)
+    ]
+    group = make_group(turns[::5][:2], 0.1)
+    assert all(is_in_use(turn, group) for turn in turns)
+
+
+def test_a_small_object_is_drawn_as_a_large_one() -> None:
+    brick = catalog.build("brick")
+    size = diameter(brick.vertices)
+    pictures = []
+    for across in (0.004, 0.2):
+        mesh = replace(brick, vertices=brick.vertices * (across / size))
+        turn = RotationalSymmetry(np.eye(3)[2], mesh.bounds.mean(0), 2, 0.0, 0.0, 0.05, True, True)
+        pictures.append(draw_symmetries(mesh, [turn], np.eye(4)[None], "found").astype(int))
+    small, large = pictures
+    assert (np.abs(large - 255).sum(-1)[-200:] > 60).mean() > 0.1
+    assert (np.abs(small - large).max(-1) > 10).mean() < 0.01
 
 
 def test_the_picture_has_a_row_a_turn() -> None:

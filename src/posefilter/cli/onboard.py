@@ -20,7 +20,7 @@ from posefilter.cli.calibrate import learn
 from posefilter.cli.checkpoints import method_of, read_checkpoint
 from posefilter.cli.choices import check_choices
 from posefilter.cli.command import compose_job
-from posefilter.cli.console import ended, say, typed, typed_prediction, warn
+from posefilter.cli.console import ended, say, setting, typed, typed_prediction, warn
 from posefilter.cli.export import strip, write_weights
 from posefilter.cli.files import save_whole
 from posefilter.cli.folders import hold_folder, move_evaluation, own_metrics
@@ -368,7 +368,7 @@ def use_symmetries(work: Onboarding) -> None:
             declared = find_declared(source, work.mesh.name, work.cfg.mesh_scale)
     if declared is not None:
         file, count = declared
-        sentence += f" ({file} declares {count}: symmetries={file})"
+        sentence += f" ({file} declares {count}: {setting('symmetries', file)})"
     say(work.cfg.console, "symmetries", sentence, found=found, picture=str(picture))
 
 

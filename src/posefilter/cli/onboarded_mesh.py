@@ -11,7 +11,7 @@ from omegaconf import DictConfig
 
 from posefilter.errors import UserError
 from posefilter.figures.canvas import save_image
-from posefilter.figures.symmetries import describe_turn, draw_symmetries
+from posefilter.figures.symmetries import describe_turn, draw_symmetries, is_in_use
 from posefilter.files import write_whole
 from posefilter.meshes.builtin import catalog
 from posefilter.meshes.files import read_mesh
@@ -125,7 +125,8 @@ def find_and_draw(mesh: Mesh, wanted: str, scale: float | None, out: Path) -> st
         used = select(turns, texture=wanted == "auto")
         entry = describe_symmetries(used, size)
         group = make_group(used, size, _STEPS)
-        found = ", ".join(map(describe_turn, used)) or "no symmetries"
+        own = [turn for turn in used if is_in_use(turn, group)]  # some may fit no group
+        found = ", ".join(map(describe_turn, own)) or "no symmetries"
     elif wanted == "none":
         entry, group, found = {"symmetries_discrete": []}, np.eye(4)[None], "no symmetries"
     else:

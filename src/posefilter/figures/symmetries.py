@@ -3,17 +3,28 @@
 from collections.abc import Sequence
 
 import numpy as np
+import torch
 
 from posefilter.figures.canvas import AXES, arrange_grid, draw_lines, draw_row
 from posefilter.geometry.rigid import move, rigid
+from posefilter.geometry.symmetries import is_ball
 from posefilter.meshes.mesh import Mesh, diameter
-from posefilter.meshes.rotational_symmetries import ANY, RotationalSymmetry
-from posefilter.meshes.symmetries import rotation_about
+from posefilter.meshes.rotational_symmetries import ANY, RotationalSymmetry, measure_angle
+from posefilter.meshes.symmetries import SAME_TURN, rotation_about
 from posefilter.rendering.embree import EmbreeRenderer
 from posefilter.rendering.surfaces import Instance, Lights
 
 _TILE = 260  # [px]
 _ANY_SHOWN = np.deg2rad(100.0)  # of a continuous symmetry
+_SAME_ANGLE = np.deg2rad(8.0)  # a fifth of a turn is no sixth
+_DISTANCE = 1.6  # of the camera, in diameters
+_WORDS = {
+    ANY: "any turn",
+    2: "half turn",
+    3: "third of a turn",
+    4: "quarter turn",
+    5: "fifth of a turn",
+}
 _LIGHTS = Lights(background=(1.0, 1.0, 1.0), specular=0.1)
 # seen from above and from the side; the camera's axes in the object's
 _VIEW = np.array([[0.8, 0.6, 0.0], [0.24, -0.32, -0.9165], [-0.55, 0.7333, -0.4]])
@@ -33,19 +44,17 @@ def draw_symmetries(
     Returns:
         The picture (h, w, 3) uint8.
     """
-    renderer, near = EmbreeRenderer(), 1.6 * diameter(mesh.vertices)
-    camera = _place_camera(mesh, near)
+    renderer, size = EmbreeRenderer(), diameter(mesh.vertices)
+    camera = _place_camera(mesh, size)
     K = np.array([[1.3 * _TILE, 0, _TILE / 2], [0, 1.3 * _TILE, _TILE / 2], [0, 0, 1.0]])
     width = 2 * _TILE + 18
     rows = [draw_row(width, f"{mesh.name}: symmetries {source}", size=16)]
     for turn in found:
-        angle = _ANY_SHOWN if turn.fold == ANY else 2 * np.pi / turn.fold
-        transform = rotation_about(turn.axis, angle, turn.point)
-        turned = camera @ transform
+        turned = camera @ _transform_of(turn)
         tiles = [_render(renderer, mesh, pose, K) for pose in (camera, turned)]
         for tile in tiles:
-            _draw_axis(tile, turn, camera, K, near)
-        mark = "in use" if _contains(symmetries, transform) else "not in use"
+            _draw_axis(tile, turn, camera, K, _DISTANCE * size)
+        mark = "in use" if is_in_use(turn, symmetries) else "not in use"
         rows.append(draw_row(width, f"{describe_turn(turn)}: {mark}", size=13))
         rows.append(draw_row(width, _measure(turn), size=11))
         rows.append(arrange_grid(tiles, 2))
@@ -57,9 +66,20 @@ def draw_symmetries(
 
 def describe_turn(turn: RotationalSymmetry) -> str:
     """Return a turn in words: `half turn about (0.00, 0.00, 1.00)`."""
-    kind = {ANY: "any turn", 2: "half turn", 3: "third of a turn", 4: "quarter turn"}[turn.fold]
     axis = ", ".join(f"{x:.2f}" for x in turn.axis + 0.0)
-    return f"{kind} about ({axis})"
+    return f"{_WORDS[turn.fold]} about ({axis})"
+
+
+def is_in_use(turn: RotationalSymmetry, symmetries: np.ndarray) -> bool:
+    """Return whether a turn is one of the symmetries (S, 4, 4), up to the error of a measured axis,
+    which changes the angle less.
+    """
+    if is_ball(torch.from_numpy(symmetries)):  # which stand for all rotations, some way apart
+        return True
+    transform = _transform_of(turn)
+    near = np.abs(symmetries - transform)[:, :3, :3].max((1, 2)) < SAME_TURN
+    alike = np.abs(measure_angle(symmetries) - measure_angle(transform)) < _SAME_ANGLE
+    return bool((near & alike).any())
 
 
 def _measure(turn: RotationalSymmetry) -> str:
@@ -70,17 +90,22 @@ def _measure(turn: RotationalSymmetry) -> str:
     )
 
 
-def _contains(symmetries: np.ndarray, transform: np.ndarray) -> bool:
-    """Tell whether a turn is one of the symmetries, up to the error of a measured axis."""
-    return bool((np.abs(symmetries - transform)[:, :3, :3].max((1, 2)) < 0.2).any())
+def _transform_of(turn: RotationalSymmetry) -> np.ndarray:
+    """Return the transform (4, 4) [m] by which a turn is shown."""
+    angle = _ANY_SHOWN if turn.fold == ANY else 2 * np.pi / turn.fold
+    return rotation_about(turn.axis, angle, turn.point)
 
 
-def _place_camera(mesh: Mesh, distance: float) -> np.ndarray:
-    """Return camera_from_object (4, 4) [m]: the object's center that far ahead."""
+def _place_camera(mesh: Mesh, size: float) -> np.ndarray:
+    """Return camera_from_object (4, 4) [m], the object's center ahead.
+
+    The object is scaled from its size [m] to 1 m: a small one would be nearer than all that is
+    drawn.
+    """
     U, _, Vt = np.linalg.svd(_VIEW)
     rotation = U @ Vt
-    rotation *= np.sign(np.linalg.det(rotation))
-    return rigid(rotation, np.array([0, 0, distance]) - rotation @ mesh.bounds.mean(0))
+    rotation *= np.sign(np.linalg.det(rotation)) / size
+    return rigid(rotation, np.array([0, 0, _DISTANCE]) - rotation @ mesh.bounds.mean(0))
 
 
 def _render(renderer: EmbreeRenderer, mesh: Mesh, pose: np.ndarray, K: np.ndarray) -> np.ndarray:

@@ -89,7 +89,7 @@ def list_discrete(turns: Sequence[RotationalSymmetry], size: float) -> list[np.n
             continue
         more = [*kept, rotation_about(turn.axis, 2 * np.pi / turn.fold, turn.point)]
         products = _close(more, size, middle)
-        if len(products) <= _MOST_ELEMENTS and min(map(_measure, products[1:])) > _SMALLEST:
+        if len(products) <= _MOST_ELEMENTS and min(map(measure_angle, products[1:])) > _SMALLEST:
             kept, group = more, products
     return group[1:]
 
@@ -125,9 +125,10 @@ def _close(generators: Sequence[np.ndarray], size: float, middle: np.ndarray) ->
     return group
 
 
-def _measure(transform: np.ndarray) -> float:
-    """Return the angle of a turn (4, 4) [rad]."""
-    return float(np.arccos(np.clip((np.trace(transform[:3, :3]) - 1) / 2, -1, 1)))
+def measure_angle(transforms: np.ndarray) -> np.ndarray:
+    """Return the angles of turns.  (..., 4, 4) -> (...) [rad]."""
+    trace = np.trace(transforms[..., :3, :3], axis1=-2, axis2=-1)
+    return np.arccos(np.clip((trace - 1) / 2, -1, 1))
 
 
 def _differ(a: np.ndarray, b: np.ndarray, size: float, middle: np.ndarray) -> bool:
