@@ -3,6 +3,7 @@
 import json
 import struct
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -12,7 +13,13 @@ from PIL import Image
 
 from posefilter.errors import UserError
 from posefilter.meshes.files import read_mesh
-from posefilter.meshes.mesh import Mesh, sample_surface, surface_colors, surface_points
+from posefilter.meshes.mesh import (
+    Mesh,
+    measure_volume,
+    sample_surface,
+    surface_colors,
+    surface_points,
+)
 
 # A pyramid over a square base: corners of the base share positions, not texture coordinates.
 OBJ = """mtllib a.mtl
@@ -409,3 +416,81 @@ def test_a_plys_texture_may_have_any_name(tmp_path: Path) -> None:
     rows = "0 0 0 0 0\n0.1 0 0 1 0\n0 0.1 0 0 1\n3 0 1 2\n"
     (tmp_path / "a.ply").write_text(header + rows, encoding="utf-8")
     np.testing.assert_array_equal(read_mesh(tmp_path / "a.ply", "a").texture, picture)
+
+
+def _export_balls(path: Path, pictures: list[Image.Image], places: list[np.ndarray]) -> None:
+    """Write a GLB of balls with normals, each with a picture and at a place (4, 4)."""
+    scene = trimesh.Scene()
+    materials = {
+        id(picture): trimesh.visual.material.PBRMaterial(baseColorTexture=picture)
+        for picture in pictures
+    }
+    for picture, place in zip(pictures, places, strict=True):
+        ball = trimesh.creation.icosphere(subdivisions=2, radius=0.05)
+        ball.vertex_normals = ball.vertices / 0.05
+        uv = np.random.default_rng(0).random((len(ball.vertices), 2))
+        ball.visual = trimesh.visual.TextureVisuals(uv=uv, material=materials[id(picture)])
+        scene.add_geometry(ball, transform=place)
+    path.write_bytes(scene.export(file_type="glb", include_normals=True))
+
+
+def test_parts_of_a_glb_with_one_picture_have_one_texture(tmp_path: Path) -> None:
+    image = np.random.default_rng(0).integers(0, 256, (32, 32, 3), dtype=np.uint8)
+    one, alike = Image.fromarray(image), Image.fromarray(image)
+    places = [trimesh.transformations.translation_matrix([0.2 * i, 0, 0]) for i in range(5)]
+    _export_balls(tmp_path / "a.glb", [one, one, alike, one, alike], places)
+    mesh = read_mesh(tmp_path / "a.glb", "a")
+    np.testing.assert_array_equal(mesh.texture, image)
+    # beside another picture it is stacked once
+    other = Image.fromarray(image[::-1].copy())
+    _export_balls(tmp_path / "b.glb", [one, one, alike, one, other], places)
+    two = read_mesh(tmp_path / "b.glb", "b")
+    assert max(two.texture.shape) <= 2 * (32 + 16)
+    faces = np.flatnonzero(two.vertices[two.faces[:, 0], 0] < 0.7)
+    weights = np.full((len(faces), 3), 1 / 3)
+    np.testing.assert_allclose(
+        surface_colors(two, faces, weights), surface_colors(mesh, faces, weights), atol=1e-4
+    )
+
+
+@pytest.mark.parametrize("scale", [(1, 1, 1), (1, 1, 0.2), (-1, 1, 0.2), (1e-3, 1e-3, 1e-3)])
+def test_a_glb_keeps_the_normals_of_its_file(
+    scale: tuple[float, float, float], tmp_path: Path
+) -> None:
+    """They move with the surface, also where it is stretched or mirrored."""
+    turn = trimesh.transformations.rotation_matrix(0.7, [1, 2, 3])
+    place = turn @ np.diag([*scale, 1.0])
+    picture = Image.fromarray(np.full((2, 2, 3), 90, np.uint8))
+    _export_balls(tmp_path / "a.glb", [picture], [place])
+    mesh = read_mesh(tmp_path / "a.glb", "a")
+    inverse = np.linalg.inv(place[:3, :3])
+    outward = mesh.vertices @ inverse.T @ inverse
+    outward /= np.linalg.norm(outward, axis=1, keepdims=True)
+    np.testing.assert_allclose(mesh.corner_normals, outward[mesh.faces], atol=1e-5)
+    volume = measure_volume(mesh.vertices, mesh.faces)
+    assert volume == pytest.approx(4 / 3 * np.pi * 0.05**3 * abs(np.prod(scale)), rel=0.1)
+
+
+@pytest.mark.parametrize(
+    ("material", "fails"),
+    [
+        ({"baseColorFactor": [0, 0, 0, 255], "emissiveFactor": [1, 0, 0]}, True),
+        ({"emissiveTexture": True, "emissiveFactor": [1, 1, 1]}, True),
+        ({"baseColorFactor": [9, 9, 9, 255], "emissiveFactor": [1, 0, 0]}, False),
+        ({"baseColorFactor": [0, 0, 0, 255]}, False),
+    ],
+)
+def test_a_color_that_is_emitted_alone_is_refused(
+    material: dict[str, Any], fails: bool, tmp_path: Path
+) -> None:
+    if "emissiveTexture" in material:
+        material = {**material, "emissiveTexture": Image.fromarray(np.eye(4, dtype=np.uint8))}
+    ball = trimesh.creation.icosphere(subdivisions=1, radius=0.05)
+    ball.visual = trimesh.visual.TextureVisuals(
+        uv=ball.vertices[:, :2], material=trimesh.visual.material.PBRMaterial(**material)
+    )
+    ball.export(tmp_path / "a.glb")
+    if fails:
+        _rejects(tmp_path / "a.glb", "a.glb", "its color in what it emits", "base color")
+    else:
+        read_mesh(tmp_path / "a.glb", "a")

@@ -1,5 +1,7 @@
 """Read OBJ, PLY and GLB files into `Mesh`."""
 
+from collections.abc import Iterator
+from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
@@ -7,6 +9,7 @@ import numpy as np
 import trimesh
 
 from posefilter.errors import UserError
+from posefilter.geometry.rigid import move
 from posefilter.meshes.atlas import merge_materials
 from posefilter.meshes.glb import check_glb
 from posefilter.meshes.mesh import Mesh, creased_normals, face_areas, looks_inward
@@ -110,8 +113,8 @@ def _read_other(path: Path) -> RawMesh:
     else:
         check_glb(path)
         loaded = trimesh.load(path, process=False)
-    parts = _list_parts(loaded) if isinstance(loaded, trimesh.Scene) else [loaded]
-    raws = [_from_trimesh(part, path) for part in parts if isinstance(part, trimesh.Trimesh)]
+    known: dict[Any, Material] = {}
+    raws = [_from_trimesh(part, place, path, known) for part, place in _list_parts(loaded)]
     if not raws:
         raise UserError(f"{path}: the mesh has no triangles (is it a point cloud, or cut short?)")
 
@@ -127,6 +130,8 @@ def _read_other(path: Path) -> RawMesh:
         return np.concatenate(filled)
 
     counts = [len(raw.faces) for raw in raws]
+    materials = {id(raw.materials[0]): raw.materials[0] for raw in raws}  # parts may share them
+    numbers = {key: i for i, key in enumerate(materials)}
     starts = np.cumsum([0] + [len(raw.vertices) for raw in raws])[:-1]
     return RawMesh(
         np.concatenate([raw.vertices for raw in raws]),
@@ -134,8 +139,8 @@ def _read_other(path: Path) -> RawMesh:
         join("corner_uv", 2, 0.0),
         join("corner_normals", 3, 0.0),
         join("corner_colors", 3, 1.0),
-        np.repeat(np.arange(len(raws)), counts),
-        [raw.materials[0] for raw in raws],
+        np.repeat([numbers[id(raw.materials[0])] for raw in raws], counts),
+        list(materials.values()),
         # trimesh divides vertices that have several texture coordinates, and a GLB counts anew in
         # each of its parts
         path.suffix.lower() == ".ply" and _count_in_file(loaded) == len(raws[0].vertices),
@@ -147,15 +152,16 @@ def _count_in_file(loaded: Any) -> int:
     return int(loaded.metadata.get("_ply_raw", {}).get("vertex", {}).get("length", -1))
 
 
-def _list_parts(scene: trimesh.Scene) -> list[Any]:
-    """Return what a scene shows, where it shows it."""
-    parts: list[Any] = scene.dump()
-    for part in parts:
-        shape: Any = scene.geometry[part.metadata["name"]]
-        own = getattr(getattr(shape, "visual", None), "vertex_attributes", {})
-        if "color" in own:  # beside a material; copies have lost them
-            part.visual.vertex_attributes["color"] = own["color"]
-    return parts
+def _list_parts(loaded: Any) -> Iterator[tuple[trimesh.Trimesh, np.ndarray]]:
+    """Yield each mesh that a file shows, and the transform (4, 4) to where it shows it.
+
+    They are no copies, which would lose normals and colors, and have a material each.
+    """
+    placed = [(loaded, np.eye(4))]
+    if isinstance(loaded, trimesh.Scene):
+        nodes = (loaded.graph[node] for node in loaded.graph.nodes_geometry)
+        placed = [(loaded.geometry[name], place) for place, name in nodes]
+    yield from ((shape, place) for shape, place in placed if isinstance(shape, trimesh.Trimesh))
 
 
 def _load_ply(path: Path) -> Any:
@@ -176,15 +182,25 @@ def _load_ply(path: Path) -> Any:
     return loaded
 
 
-def _from_trimesh(mesh: trimesh.Trimesh, path: Path) -> RawMesh:
+def _from_trimesh(
+    mesh: trimesh.Trimesh, place: np.ndarray, path: Path, known: dict[Any, Material]
+) -> RawMesh:
+    """Return a mesh at its place (4, 4); its material is one of those `known`, or is added."""
+    # set by trimesh's readers only where the file has normals
+    given = mesh._cache.cache.get("vertex_normals")
     faces = np.asarray(mesh.faces, dtype=np.int64)
+    if np.linalg.det(place[:3, :3]) < 0:  # a mirror image has its corners the other way round
+        faces = faces[:, ::-1]
     visual = mesh.visual
     uv = colors = None
     material = PLAIN
     linear = path.suffix.lower() == ".glb"  # factors and colors of vertices, by the format
     if isinstance(visual, trimesh.visual.TextureVisuals):
         uv = None if visual.uv is None else np.asarray(visual.uv)[faces]
-        material = _trimesh_material(visual.material)
+        if id(visual.material) not in known:
+            material = _trimesh_material(visual.material, linear)
+            known[id(visual.material)] = known.setdefault(_identify(material), material)
+        material = known[id(visual.material)]
         own = visual.vertex_attributes.get("color")
         colors = None if own is None else _unit(np.asarray(own))[:, :3][faces]
         if uv is None and material.image is not None and np.ptp(material.image, (0, 1)).any():
@@ -197,14 +213,21 @@ def _from_trimesh(mesh: trimesh.Trimesh, path: Path) -> RawMesh:
         if len(colors) != len(faces):  # of polygons
             raise UserError(f"{path}: {len(colors)} colors for {len(faces)} triangles; triangulate")
         material = Material(np.ones(3), None)
-    if linear and material is not PLAIN:
-        material = material._replace(color=_encode_srgb(material.color))
-        colors = None if colors is None else _encode_srgb(colors)
-    # set by trimesh's readers only where the file has normals
-    given = mesh._cache.cache.get("vertex_normals")
-    normals = None if given is None else np.asarray(given)[faces]
+    if linear and colors is not None:
+        colors = _encode_srgb(colors)
+    vertices = move(np.asarray(mesh.vertices), place)
+    normals = None if given is None else _move_normals(np.asarray(given), place)[faces]
     alike = np.zeros(len(faces), dtype=np.int64)
-    return RawMesh(np.asarray(mesh.vertices), faces, uv, normals, colors, alike, [material])
+    return RawMesh(vertices, faces, uv, normals, colors, alike, [material])
+
+
+def _move_normals(normals: np.ndarray, place: np.ndarray) -> np.ndarray:
+    """Return normals where a transform moves their surface.  (V, 3), (4, 4) -> (V, 3)."""
+    a, b, c = place[:3, :3].T
+    # the inverse transpose but for its length, which there is of a flattened surface too
+    cofactors = np.stack([np.cross(b, c), np.cross(c, a), np.cross(a, b)])
+    moved = normals @ cofactors * np.sign(np.linalg.det(place[:3, :3]) or 1.0)
+    return moved / np.maximum(np.linalg.norm(moved, axis=1, keepdims=True), 1e-30)
 
 
 def _unit(colors: np.ndarray) -> np.ndarray:
@@ -219,16 +242,25 @@ def _encode_srgb(linear: np.ndarray) -> np.ndarray:
     return np.where(linear <= 0.0031308, 12.92 * linear, high)
 
 
-def _trimesh_material(material: object) -> Material:
+def _identify(material: Material) -> Any:
+    """Return what materials that look alike have in common."""
+    color, image = material
+    picture = None if image is None else (image.shape, sha256(image.tobytes()).digest())
+    return tuple(color.tolist()), picture
+
+
+def _trimesh_material(material: object, linear: bool) -> Material:
+    """Return a material; a color that is `linear` is converted to sRGB."""
     factor = getattr(material, "baseColorFactor", None)
     image = getattr(material, "baseColorTexture", None) or getattr(material, "image", None)
-    color = np.ones(3) if factor is None else np.asarray(factor, dtype=np.float64)[:3] / 255
-    if image is not None and image.mode.startswith("I"):  # 16 bits, which PIL would cut off at 255
+    color = factor
+    if factor is None and image is None:
+        color = getattr(material, "diffuse", None)
+    color = np.ones(3) if color is None else np.asarray(color, dtype=np.float64)[:3] / 255
+    color = _encode_srgb(color) if linear else color
+    if image is None:
+        return Material(color, None)
+    if image.mode.startswith("I"):  # 16 bits, which PIL would cut off at 255
         gray = np.round(np.asarray(image, dtype=np.float64) / 257).clip(0, 255)
         return Material(color, gray.astype(np.uint8)[..., None].repeat(3, axis=2))
-    if image is not None:
-        return Material(color, np.asarray(image.convert("RGB")))
-    diffuse = getattr(material, "diffuse", None)
-    if factor is None and diffuse is not None:
-        color = np.asarray(diffuse, dtype=np.float64)[:3] / 255
-    return Material(color, None)
+    return Material(color, np.asarray(image.convert("RGB")))

@@ -113,7 +113,16 @@ def _check_surfaces(content: Mapping[str, Any], path: Path) -> None:
         gloss = material.get("extensions", {}).get("KHR_materials_pbrSpecularGlossiness")
         if gloss is not None and not {"diffuseFactor", "specularFactor"} <= set(gloss):
             raise UserError(f"{path}: uses KHR_materials_pbrSpecularGlossiness; export it without")
-        used = material.get("pbrMetallicRoughness", {}).get("baseColorTexture")
+        base = material.get("pbrMetallicRoughness", {})
+        used = base.get("baseColorTexture")
+        black = not any(base.get("baseColorFactor", (1, 1, 1, 1))[:3])
+        if any(material.get("emissiveFactor", ())) and (
+            black or (used is None and "emissiveTexture" in material)
+        ):
+            raise UserError(
+                f"{path}: a material has its color in what it emits, which is not read; make that "
+                "its base color"
+            )
         if used is None:
             continue
         if used.get("texCoord", 0) != 0:
