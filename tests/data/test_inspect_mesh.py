@@ -13,7 +13,13 @@ from posefilter.errors import UserError
 from posefilter.meshes.builtin import catalog
 from posefilter.meshes.files import read_mesh
 from posefilter.meshes.inspect_mesh import check_size, inspect_mesh, list_concerns
-from posefilter.meshes.mesh import Mesh, sample_surface, surface_colors, surface_points
+from posefilter.meshes.mesh import (
+    Mesh,
+    grid_faces,
+    sample_surface,
+    surface_colors,
+    surface_points,
+)
 from posefilter.meshes.write import write_obj
 
 
@@ -54,6 +60,24 @@ def test_a_hole_and_a_lost_texture_are_reported(brick: Mesh) -> None:
     for mesh, word in ((halved, "not closed"), (plain, "one color")):
         (concern,) = list_concerns(inspect_mesh(mesh))
         assert word in concern
+
+
+@pytest.mark.parametrize("inward", [False, True])
+def test_faces_without_an_area_leave_a_surface_closed(inward: bool, tmp_path: Path) -> None:
+    """A ball of a grid of angles has some at its poles."""
+    polar, turn = np.meshgrid(np.linspace(0, np.pi, 13), np.linspace(0, 2 * np.pi, 17)[:-1])
+    x, y = 0.05 * np.sin(polar) * np.cos(turn), 0.05 * np.sin(polar) * np.sin(turn)
+    points = np.stack([x, y, 0.05 * np.cos(polar)], axis=-1).reshape(-1, 3)
+    faces = grid_faces(17, 13) % len(points)
+    faces = faces[:, ::-1] if inward else faces
+    lines = [f"v {a:.7f} {b:.7f} {c:.7f}" for a, b, c in points.tolist()]
+    lines += [f"f {a} {b} {c}" for a, b, c in (1 + faces).tolist()]
+    (tmp_path / "ball.obj").write_text("\n".join(lines))
+    ball = read_mesh(tmp_path / "ball.obj", "ball")
+    facts = inspect_mesh(ball)
+    assert facts.open_edges == 0
+    assert facts.volume_cm3 == pytest.approx(4 / 3 * np.pi * 125, rel=0.1)
+    assert not any("not closed" in concern for concern in list_concerns(facts))
 
 
 @pytest.mark.parametrize(

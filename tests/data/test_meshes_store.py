@@ -77,6 +77,12 @@ def test_what_a_mac_puts_beside_a_file_is_no_mesh(tmp_path: Path) -> None:
     assert len(store.load("mug").faces) == 12
 
 
+def test_a_mesh_without_a_hull_is_named_by_its_file(tmp_path: Path) -> None:
+    (tmp_path / "flat.obj").write_text("v 0 0 0\nv 0.1 0 0\nv 0 0.1 0\nf 1 2 3\n")
+    message = _fails(MeshStore(tmp_path), "flat")
+    assert message == f"{tmp_path / 'flat.obj'}: has 3 vertices; an object has 4 or more"
+
+
 def test_unknown_names_say_the_nearest(tmp_path: Path) -> None:
     _box(tmp_path / "003_cracker_box.obj")
     assert "'003_cracker_box'" in _fails(MeshStore(tmp_path), "cracker_box")

@@ -96,6 +96,27 @@ def test_a_box_is_in_the_unit_of_the_mesh_file(tmp_path: Path, meshes: MeshStore
     assert read_parts(file, "another", 0.001, mesh) == {}
 
 
+@pytest.mark.parametrize("kind", ["box", "vertices"])
+def test_a_part_may_have_the_name_of_a_kind(kind: str, tmp_path: Path) -> None:
+    root = write_mesh(tmp_path / "meshes", "obj_000002")
+    own = {kind: {"vertices": list(range(8))}, "rest": {"vertices": list(range(8, 16))}}
+    (root / "parts.json").write_text(json.dumps({"obj_000002": own, "another": own}))
+    parts = MeshStore(root).load("obj_000002").parts
+    assert {part: int(faces.sum()) for part, faces in parts.items()} == {kind: 12, "rest": 12}
+
+
+def test_a_vertex_that_no_face_uses_may_be_listed(tmp_path: Path) -> None:
+    corners = "v 0 0 0\nv .1 0 0\nv 0 .1 0\nv 0 0 .1\nv .2 .2 .2\nv .3 .3 .3\n"
+    faces = "f 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n"
+    (tmp_path / "a.obj").write_text(corners + faces)
+    file = tmp_path / "parts.json"
+    file.write_text(json.dumps({"a": {"tip": {"vertices": [0, 1, 5]}}}))
+    assert MeshStore(tmp_path).load("a").parts["tip"].tolist() == [True, True, False, False]
+    file.write_text(json.dumps({"a": {"tip": {"vertices": [0, 1, 6]}}}))
+    with pytest.raises(UserError, match="the mesh has vertices 0 to 5"):
+        MeshStore(tmp_path).load("a")
+
+
 def test_a_face_belongs_to_the_first_part_that_has_it(meshes: MeshStore) -> None:
     mesh = meshes.load("obj_000002")
     everything = np.ones(len(mesh.faces), bool)

@@ -94,7 +94,12 @@ def _finish(raw: RawMesh, path: Path, name: str, scale: float) -> Mesh:
         normals = np.where(length > 1e-6, given, normals).astype(np.float32)
     uv, texture, colors = merge_materials(raw, path)
     numbers = used if raw.numbered else np.zeros(0, np.int64)
-    return Mesh(name, vertices, faces, uv, texture, colors, normals, numbers=numbers)
+    count = len(raw.vertices)
+    return Mesh(
+        *(name, vertices, faces, uv, texture, colors, normals),
+        numbers=numbers,
+        file_vertices=count,
+    )
 
 
 def _reverse_corners(raw: RawMesh) -> RawMesh:

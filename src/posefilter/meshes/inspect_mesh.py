@@ -93,8 +93,8 @@ def list_concerns(facts: MeshFacts) -> list[str]:
     if facts.open_edges > OPEN_EDGES:
         share = 100 * facts.open_edges
         out.append(
-            f"The surface is not closed ({share:.0f} % of its edges belong to one face): renders "
-            "may show its inside."
+            f"The surface is not closed ({share:.0f} % of its edges do not belong to two faces): "
+            "renders may show its inside."
         )
     if not facts.colored:
         out.append("It has one color: what is printed on the real object is not learned.")

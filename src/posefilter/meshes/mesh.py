@@ -49,6 +49,7 @@ class Mesh:
     parts: Mapping[str, np.ndarray] = field(default_factory=dict)
     # (V,) each vertex's number in its file, which may have others that no face uses; None: the same
     numbers: np.ndarray | None = None
+    file_vertices: int | None = None  # how many its file has; None: as many
 
     @cached_property
     def bounds(self) -> np.ndarray:
@@ -74,8 +75,15 @@ def _weld(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
 
 
 def find_open_edges(vertices: np.ndarray, faces: np.ndarray) -> float:
-    """Return the share of edges that do not belong to two triangles.  (V, 3) [m], (F, 3)."""
-    edges = np.sort(_weld(vertices, faces)[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
+    """Return the share of edges that do not belong to two triangles.  (V, 3) [m], (F, 3).
+
+    Triangles with two corners in one place, as at the poles of a ball, bound nothing.
+    """
+    corners = _weld(vertices, faces)
+    corners = corners[(corners != np.roll(corners, 1, axis=1)).all(axis=1)]
+    if len(corners) == 0:
+        return 1.0
+    edges = np.sort(corners[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
     return float((np.unique(edges, axis=0, return_counts=True)[1] != 2).mean())
 
 
@@ -90,7 +98,10 @@ def measure_volume(vertices: np.ndarray, faces: np.ndarray) -> float:
 
 
 def looks_inward(vertices: np.ndarray, faces: np.ndarray) -> bool:
-    """Return whether a surface is closed, with its faces looking inward.  (V, 3) [m], (F, 3)."""
+    """Return whether a surface is closed, with its faces looking inward.  (V, 3) [m], (F, 3).
+
+    Of several bodies, the sum of their volumes decides.
+    """
     inward = measure_volume(vertices, faces) < 0
     return inward and find_open_edges(vertices, faces) <= OPEN_EDGES
 

@@ -76,7 +76,12 @@ def has_one_object(file: Path) -> bool:
 
 def _is_of_one(table: Mapping[str, object]) -> bool:
     """Return whether a file holds the parts of one object alone."""
-    return any(isinstance(one, dict) and {"box", "vertices"} & set(one) for one in table.values())
+    return any(
+        # a part may have the name of a kind; its value is a mapping then
+        isinstance(one, dict) and key in one and not isinstance(one[key], dict)
+        for one in table.values()
+        for key in ("box", "vertices")
+    )
 
 
 def assign(wholes: Mapping[str, np.ndarray], said: str) -> dict[str, np.ndarray]:
@@ -143,8 +148,9 @@ def _select(one: Any, scale: float, mesh: Mesh, said: str) -> np.ndarray:
                     "vertices of a GLB, or of a PLY with texture coordinates by face, have no "
                     "numbers that can be told; use a box"
                 )
-            if len(listed) == 0 or listed.min() < 0 or listed.max() > numbers.max():
-                raise ValueError(f"the mesh has vertices 0 to {numbers.max()}")
+            count = mesh.file_vertices or len(numbers)  # some of which no face may use
+            if len(listed) == 0 or listed.min() < 0 or listed.max() >= count:
+                raise ValueError(f"the mesh has vertices 0 to {count - 1}")
             corners_in: np.ndarray = np.isin(numbers, listed)[mesh.faces].sum(axis=1) >= 2
             return corners_in
     except (TypeError, ValueError, KeyError, OverflowError) as error:

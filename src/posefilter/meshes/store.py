@@ -282,7 +282,10 @@ def _rank(path: Path) -> int:
 
 def _check_unit(mesh: Mesh, path: Path, scale: float) -> None:
     """Raise UserError, naming the setting to change, where an object has an impossible size."""
-    across = diameter(mesh.vertices)
+    try:
+        across = diameter(mesh.vertices)
+    except UserError as error:
+        raise UserError(f"{path}: {str(error).removeprefix('mesh: ')}") from error
     if SMALLEST <= across <= LARGEST:
         return
     if across > LARGEST:
