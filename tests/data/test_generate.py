@@ -19,11 +19,15 @@ from scipy.spatial.transform import Rotation
 
 from posefilter.data.generated_scenes import ensure_scenes
 from posefilter.errors import UserError
+from posefilter.meshes.mesh import Mesh, creased_normals
 from posefilter.meshes.store import MeshStore
 from posefilter.rendering.embree import EmbreeRenderer, render_depth
+from posefilter.rendering.surfaces import Instance, Rendered
 from posefilter.synthetic import fat_format
-from posefilter.synthetic.frame_renderer import make_renderer
+from posefilter.synthetic.frame_renderer import FrameRenderer, make_renderer
 from posefilter.synthetic.generate import camera_matrix, generate
+from posefilter.synthetic.placing import View
+from posefilter.synthetic.scenes import Layout
 
 SIZE = (160, 120)
 SETTINGS: dict[str, Any] = {
@@ -372,6 +376,65 @@ def test_a_record_from_before_meshes_had_a_scale_goes_on(alone: Path, tmp_path: 
     del record["settings"]["mesh_scale"], record["mesh"]
     (out / "_generator.json").write_text(json.dumps(record))
     assert generate(out, 7, **SETTINGS).rendered == 0
+
+
+def _write_cube(folder: Path, side: float) -> Path:
+    folder.mkdir()
+    trimesh.creation.box([side] * 3).export(folder / "cube.obj")
+    return folder
+
+
+def test_an_object_that_is_too_small_is_refused_before_anything_is_rendered(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(FrameRenderer, "draw", lambda self, frame: pytest.fail("drawn"))
+    meshes = _write_cube(tmp_path / "meshes", 0.005)
+    with pytest.raises(UserError, match=r"object=cube: is too small .* covers \d+ of 19,200 pix"):
+        generate(tmp_path / "out", 1, meshes, "cube", size=(160, 120), progress=False)
+    assert not (tmp_path / "out").exists()
+
+
+def test_layouts_that_cannot_show_the_object_are_not_rendered_and_the_others_stay(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Frames are the same bytes as where each layout is rendered, in fewer renders."""
+    meshes = _write_cube(tmp_path / "meshes", 0.01)
+    render, counts, found = FrameRenderer._render, [], []
+
+    def count(self: FrameRenderer, layout: Layout) -> Rendered:
+        counts[-1] += 1
+        return render(self, layout)
+
+    monkeypatch.setattr(FrameRenderer, "_render", count)
+    for name in ("a", "b"):
+        counts.append(0)
+        generate(
+            tmp_path / name, 2, meshes, "cube", size=(160, 120), distractors=(0, 1),
+            workers=1, progress=False,
+        )  # fmt: skip
+        found.append(contents(tmp_path / name))
+        monkeypatch.setattr(View, "most_pixels", lambda self, mesh, nearest: np.inf)
+    assert found[0] == found[1]
+    assert counts[0] < counts[1]
+
+
+@pytest.mark.parametrize("sides", [(0.1, 0.1, 0.1), (0.3, 0.004, 0.004), (0.2, 0.3, 0.001)])
+def test_no_object_covers_more_pixels_than_it_may(sides: tuple[float, float, float]) -> None:
+    body = trimesh.creation.box(sides)
+    vertices, faces = np.array(body.vertices), np.array(body.faces)
+    gray, normals = np.full((1, 1, 3), 90, np.uint8), creased_normals(vertices, faces)
+    mesh = Mesh("box", vertices, faces, None, gray, None, normals)
+    K, rng = np.array(camera_matrix("ycb_video", 160, 120)), np.random.default_rng(0)
+    view, renderer, shares = View(K, 120, 160), EmbreeRenderer(), []
+    for _ in range(60):
+        pose = np.eye(4)
+        pose[:3, :3] = Rotation.random(rng=rng).as_matrix()
+        pose[:3, 3] = view.ray(*rng.random(2)) * rng.uniform(0.4, 0.8)
+        nearest = float((vertices @ pose[:3, :3].T + pose[:3, 3])[:, 2].min())
+        _, index = renderer.depth([Instance(mesh, pose)], K, 120, 160)
+        shares.append((index == 0).sum() / view.most_pixels(mesh, nearest))
+    assert max(shares) <= 1
+    assert max(shares) > 0.2
 
 
 def test_the_renderers_names(tmp_path: Path) -> None:

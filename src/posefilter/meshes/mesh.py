@@ -56,6 +56,18 @@ class Mesh:
         """Lowest and highest corner of the axis-aligned bounding box, (2, 3) [m]."""
         return np.stack([self.vertices.min(0), self.vertices.max(0)])
 
+    @cached_property
+    def hull_areas(self) -> tuple[float, float]:
+        """Area of the convex hull's surface, and a bound of that of its projections [m^2].
+
+        Along u, that is half the sum of a |n . u| over faces of area a and normal n; by Cauchy and
+        Schwarz the sum is at most the root of (sum of a) times (sum of a (n . u)^2).
+        """
+        normals = face_normals(self.vertices, find_hull(self.vertices).simplices)
+        areas = np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-20)
+        largest = np.linalg.eigvalsh((normals / areas).T @ normals)[-1]
+        return float(areas.sum() / 2), float(np.sqrt(areas.sum() * largest) / 4)
+
 
 def face_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     """Return normals as long as twice the area of each triangle.  (V, 3) [m], (F, 3) -> (F, 3)."""

@@ -52,6 +52,14 @@ class Job:
     mesh_scale: float = 1.0  # meters a unit of the mesh files
     motion: MotionSettings = field(default_factory=MotionSettings)
 
+    def view(self) -> View:
+        """Return the camera."""
+        return View(np.array(self.K), self.height, self.width)
+
+    def least_pixels(self) -> float:
+        """Return how many pixels the target has to cover, were nothing in front of it."""
+        return 0.002 * self.width * self.height
+
     def folder(self, frame: int) -> str:
         """Return the folder of a frame."""
         return f"mixed/scene{frame // self.frames_per_scene:04d}_0"
@@ -174,7 +182,7 @@ class FrameRenderer:
         """
         scene, _ = self.scene(number)
         rng = np.random.default_rng([self.job.seed, 4, number])
-        view = View(self.K, self.job.height, self.job.width)
+        view = self.job.view()
         for layout, _ in self._draw_layouts(scene, rng):
             for _ in range(8):
                 found = draw_scenario(
@@ -202,6 +210,8 @@ class FrameRenderer:
             if drawn is None:
                 continue
             layout = remove_target(drawn) if absent else drawn
+            if not self._may_show(layout):  # so that it need not be rendered
+                continue
             picture = self._render(layout)
             if all(self._shows(picture, k) for k in range(layout.targets)):
                 yield layout, picture
@@ -225,10 +235,20 @@ class FrameRenderer:
                 fat.write_image(next(files), image)
             fat.write_json(next(files), record)
 
+    def _may_show(self, layout: Layout) -> bool:
+        """Return whether each instance of the target may be large enough, by an upper bound."""
+        view = self.job.view()
+        for one in layout.placed[: layout.targets]:
+            mesh = one.solid.mesh
+            reach = float(np.linalg.norm(np.ptp(mesh.bounds, axis=0))) / 2
+            if view.most_pixels(mesh, one.center[2] - reach) < self.job.least_pixels():
+                return False
+        return True
+
     def _shows(self, picture: Rendered, instance: int) -> bool:
         """Return whether enough of an instance of the target is visible."""
         seen, alone = int((picture.index == instance).sum()), int(picture.unoccluded[instance])
-        least = 0.002 * self.job.width * self.job.height
+        least = self.job.least_pixels()
         return alone >= least and seen >= (1 - self.job.scenes.max_occlusion) * alone
 
     def _images(

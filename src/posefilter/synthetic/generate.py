@@ -362,7 +362,8 @@ def check_meshes(job: Job, store: MeshStore, frames: Sequence[int]) -> None:
         frames: Numbers of the frames.
 
     Raises:
-        UserError: One is missing, cannot be read, or is in another unit.
+        UserError: One is missing, cannot be read, or is in another unit, or the object is too small
+            for the camera.
     """
     if store.is_part(job.object):
         base = split_part(job.object)[0]
@@ -371,13 +372,29 @@ def check_meshes(job: Job, store: MeshStore, frames: Sequence[int]) -> None:
             f"data.object={job.object}"
         )
     if job.object not in store.names() or frames:
-        store.load(job.object)
+        mesh = store.load(job.object)
+        if job.motion.moves != "none" or not all(map(job.lacks_target, frames)):
+            _check_apparent_size(job, mesh)
     if job.meshes == BUILTIN:
         return
     for number in sorted({frame // job.frames_per_scene for frame in frames}):
         rng = job.scene_generator(number)
         for name in choose_distractors(store, job.object, job.scenes, rng):
             store.load(name)
+
+
+def _check_apparent_size(job: Job, mesh: Mesh) -> None:
+    """Raise UserError where no frame can show enough of an object, before hundreds are tried."""
+    if job.scenes.settle:  # what falls may come nearer
+        return
+    nearest = job.scenes.distance[0] - float(np.linalg.norm(np.ptp(mesh.bounds, axis=0))) / 2
+    most, least = job.view().most_pixels(mesh, nearest), job.least_pixels()
+    if most < least:
+        raise UserError(
+            f"object={job.object}: is too small for this camera: covers {most:.0f} of "
+            f"{job.width * job.height:,} pixels at most, {least:.0f} are the least; mind its unit "
+            "(mesh_scale), or choose a longer focal length (camera)"
+        )
 
 
 def digest_mesh(mesh: Mesh) -> str:

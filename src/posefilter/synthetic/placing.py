@@ -7,6 +7,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from posefilter.geometry.rigid import move, rigid
+from posefilter.meshes.mesh import Mesh
 from posefilter.rendering.surfaces import project
 from posefilter.synthetic.solids import Solid, outline_mask, separated
 
@@ -57,6 +58,25 @@ class View:
         pixels = project(one.hull, self.K)
         inside = ((pixels >= 0) & (pixels < [self.width, self.height])).all(1)
         return bool(inside.mean() >= 1 - largest_truncation)
+
+    def most_pixels(self, mesh: Mesh, nearest: float) -> float:
+        """Return how many pixels an object covers at most whose points are all at a depth of at
+        least `nearest` [m].
+
+        It is the bound of a parallel projection's area, or half of the surface where the object is
+        so near that it is seen from several sides. A convex region of area A and perimeter P has at
+        most A + P / 2 + 1 pixels' centers.
+        """
+        if nearest <= 0:
+            return np.inf
+        # by which a length in the frame's corner is longer than in its middle
+        stretch = max(float(np.linalg.norm(self.ray(u, v))) for u in (0, 1) for v in (0, 1))
+        x, y = float(self.K[0, 0]), float(self.K[1, 1])
+        size = float(np.linalg.norm(np.ptp(mesh.bounds, axis=0)))
+        surface, shadow = mesh.hull_areas
+        seen = min(surface / 2, shadow + surface / 2 * size / nearest)
+        area = seen * x * y * stretch / nearest**2
+        return area + np.pi / 2 * size * max(x, y) * stretch / nearest + 1
 
     def mask(self, one: Placed) -> np.ndarray:
         """Return the coarse mask of an object."""
