@@ -5,10 +5,10 @@ import torch
 
 from posefilter.geometry.camera import intrinsics, pixel_grid, rays
 from posefilter.geometry.pose import make_pose
+from posefilter.geometry.rotation import fibonacci_sphere
 from posefilter.nets.coordinates import Context
 from posefilter.nets.likelihood import Pixels, PoseLikelihood, flatten_images
 from posefilter.nets.surface_term import SurfaceTerm
-from posefilter.synthetic.solids import fibonacci_sphere
 
 H, W, BALL, WALL, RADIUS = 120, 160, 0.8, 1.5, 0.1  # distances [m]
 K = intrinsics(200.0, 200.0, 79.5, 59.5)[None]

@@ -1,7 +1,5 @@
 """On which pixels an object is seen at a pose, and an image without them."""
 
-import math
-
 import cv2
 import numpy as np
 import torch
@@ -10,6 +8,7 @@ from torch import Tensor
 
 from posefilter.geometry.camera import back_project, pixel_grid, project
 from posefilter.geometry.pose import invert, transform
+from posefilter.geometry.rotation import fibonacci_sphere
 from posefilter.types import Batch, ObjectModel
 
 _NOISE, _SHARE = 0.004, 0.02  # [m] of the depth; of the diameter
@@ -87,12 +86,8 @@ def blank(batch: Batch, hidden: Tensor) -> Batch:
 
 def _spread_directions(count: int) -> Tensor:
     """Return unit vectors (count + 6, 3): a Fibonacci lattice, and the axes both ways."""
-    i = torch.arange(count, dtype=torch.float64) + 0.5
-    z, turn = 1 - 2 * i / count, math.pi * (1 + math.sqrt(5)) * i
-    flat = (1 - z * z).sqrt()
-    lattice = torch.stack([flat * turn.cos(), flat * turn.sin(), z], -1)
-    axes = torch.eye(3, dtype=torch.float64)
-    return torch.cat([lattice, axes, -axes])
+    axes = np.eye(3)
+    return torch.from_numpy(np.concatenate([fibonacci_sphere(count), axes, -axes]))
 
 
 def _cover(

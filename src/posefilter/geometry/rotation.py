@@ -6,6 +6,7 @@ Conventions: active rotations, column vectors (x' = R x), radians, unit quaterni
 import math
 from typing import Any
 
+import numpy as np
 import torch
 import torch.nn.functional as F
 from torch import Tensor
@@ -112,6 +113,14 @@ def spread_rotations(count: int) -> Tensor:
     r, s = share.sqrt(), (1 - share).sqrt()
     quat = torch.stack([r * a.sin(), r * a.cos(), s * b.sin(), s * b.cos()], dim=-1)
     return matrix_from_quat_xyzw(quat).float()
+
+
+def fibonacci_sphere(count: int) -> np.ndarray:
+    """Return evenly spread unit directions.  -> (count, 3)."""
+    k = np.arange(count) + 0.5
+    z, turn = 1 - 2 * k / count, np.pi * (1 + 5**0.5) * k
+    ring = np.sqrt(1 - z * z)
+    return np.stack([ring * np.cos(turn), ring * np.sin(turn), z], 1)
 
 
 def angle_between(a: Tensor, b: Tensor) -> Tensor:

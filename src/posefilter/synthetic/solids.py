@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
+from posefilter.geometry.rotation import fibonacci_sphere
 from posefilter.meshes.mesh import Mesh
 from posefilter.rendering.surfaces import project
 
@@ -73,14 +74,6 @@ def rotation_down(direction: np.ndarray) -> np.ndarray:
         return np.diag([1.0, -1.0, -1.0])
     K = np.array([[0, -axis[2], axis[1]], [axis[2], 0, -axis[0]], [-axis[1], axis[0], 0]])
     return np.eye(3) + K + K @ K / (1 + cosine)
-
-
-def fibonacci_sphere(count: int) -> np.ndarray:
-    """Return evenly spread unit directions.  -> (count, 3)."""
-    k = np.arange(count) + 0.5
-    z, turn = 1 - 2 * k / count, np.pi * (1 + 5**0.5) * k
-    ring = np.sqrt(1 - z * z)
-    return np.stack([ring * np.cos(turn), ring * np.sin(turn), z], 1)
 
 
 _DIRECTIONS = fibonacci_sphere(160)
