@@ -1,31 +1,29 @@
 """What a tracker is set to."""
 
-import math
 from dataclasses import dataclass, field, fields
-from numbers import Real
 from typing import Any, cast
 
 from posefilter.errors import UserError
+from posefilter.ranges import find_range
 from posefilter.tracking.motion import ConstantVelocity
 
 
-def check_types(settings: Any) -> None:
-    """Raise UserError where a setting is no finite number, or of another class."""
+def check_settings(settings: Any, place: str) -> None:
+    """Check each setting by the range of its place, and those without a range by their class.
+
+    Args:
+        settings: A dataclass.
+        place: Of its settings in `RANGES`.
+
+    Raises:
+        UserError: A setting is outside of its range, or of another class.
+    """
     for one in fields(settings):
-        value, kind = getattr(settings, one.name), cast(type, one.type)
-        if kind not in (int, float):
-            if not isinstance(value, kind):
-                raise UserError(f"tracker: {one.name}={value} must be of {kind.__name__}")
-        elif not (isinstance(value, Real) and math.isfinite(value)):
-            raise UserError(f"tracker: {one.name}={value} must be a finite number")
-
-
-def check_whole(settings: object, **minimums: int) -> None:
-    """Raise UserError where a setting is no whole number, or below its least value."""
-    for name, bound in minimums.items():
-        value = getattr(settings, name)
-        if not isinstance(value, int) or isinstance(value, bool) or value < bound:
-            raise UserError(f"tracker: {name}={value} must be a whole number, {bound} or more")
+        value, allowed = getattr(settings, one.name), find_range(f"{place}.{one.name}")
+        kind = cast(type, one.type)
+        if not (isinstance(value, kind) if allowed is None else allowed.holds(value)):
+            expected = f"of {kind.__name__}" if allowed is None else allowed
+            raise UserError(f"tracker: {one.name}={value} must be {expected}")
 
 
 @dataclass(frozen=True)
@@ -56,17 +54,16 @@ class FilterSettings:
 
     def __post_init__(self) -> None:
         """Check the numbers."""
-        check_types(self)
-        check_whole(self, min_particles=1, max_particles=1, proposals=0, steps=1, pixels=1)
+        check_settings(self, "tracker.follow")  # the ranges of probe and search are the same
         if self.max_particles < self.min_particles:
             raise UserError(
                 f"tracker: max_particles={self.max_particles} is below "
                 f"min_particles={self.min_particles}"
             )
-        if not 0 < self.final_sigma <= self.initial_sigma:
+        if self.final_sigma > self.initial_sigma:
             raise UserError(
-                f"tracker: initial_sigma={self.initial_sigma}, "
-                f"final_sigma={self.final_sigma}: noise levels fall, and are above 0"
+                f"tracker: initial_sigma={self.initial_sigma}, final_sigma={self.final_sigma}: "
+                "noise levels fall"
             )
 
 
@@ -141,24 +138,8 @@ class TrackerSettings:
 
     def __post_init__(self) -> None:
         """Check the numbers."""
-        check_types(self)
-        check_whole(self, quadratic_fits=0, fit_pixels=1, patience=1, probe_every=1)
-        check_whole(self, whole_image_every=0, window_side=64, search_every=0, texture_every=0)
-        least = min(self.noise_scale, self.smoothing_noise, self.jump_penalty, self.icp_prior)
-        if not (min(least, self.elsewhere_penalty) >= 0 and self.window_scale >= 1):
+        check_settings(self, "tracker")
+        if self.lost_below > self.found_above:
             raise UserError(
-                "tracker: noise_scale, smoothing_noise, jump_penalty, elsewhere_penalty and "
-                "icp_prior must be 0 or more, window_scale 1 or more"
-            )
-        if not 0 <= self.search_above <= 1:
-            raise UserError(f"tracker: search_above={self.search_above} must lie in [0, 1]")
-        if not 0 <= self.lost_below <= self.found_above <= 1:
-            raise UserError(
-                f"tracker: lost_below={self.lost_below} and found_above={self.found_above} must "
-                f"lie in [0, 1], the second no lower"
-            )
-        if not (self.kld_epsilon > 0 and self.kld_bin_size > 0 and 0 < self.kld_quantile < 1):
-            raise UserError(
-                "tracker: kld_epsilon and kld_bin_size must be above 0, kld_quantile between "
-                "0 and 1"
+                f"tracker: lost_below={self.lost_below} is above found_above={self.found_above}"
             )
