@@ -13,7 +13,7 @@ import pytest
 
 from posefilter.errors import UserError
 from posefilter.metrics.image_errors import FILE, ImageError, write_errors
-from posefilter.report.blocks import Paragraph, Section, Text
+from posefilter.report.blocks import Paragraph, Section, Table, Text
 from posefilter.report.comparison_page import (
     judge,
     list_settings,
@@ -117,7 +117,7 @@ def test_ranges_that_share_images_are_apart(run: Path) -> None:
     (run / "metrics.json").write_text(json.dumps(metrics))
     page = make_run_page(read_run(run), None, "x")
     (blocks,) = [section.blocks for section in page.sections if section.title == "Results"]
-    apart, above = [b for b in blocks if b.kind == "table"][1:3]
+    apart, above = [b for b in blocks if isinstance(b, Table)][1:3]
     assert [row[:2] for row in apart.rows] == [
         ["0 to 0.3", "1"],
         ["0.3 to 0.5", "2"],

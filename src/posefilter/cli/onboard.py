@@ -4,7 +4,7 @@ import math
 import time
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cached_property, partial
 from hashlib import sha256
 from pathlib import Path
@@ -83,29 +83,13 @@ class Stage(NamedTuple):
     costly: bool = False
 
 
-@dataclass
 class Onboarding:
     """What is asked for, and where it goes."""
 
-    cfg: DictConfig
-    mesh: Mesh
-    out: Path
-    stages: Stages
-
-    @property
-    def data(self) -> Path:
-        """The renders' folder."""
-        return self.out / "data"
-
-    @property
-    def training(self) -> Path:
-        """The training's run folder."""
-        return self.out / "training"
-
-    @property
-    def weights(self) -> Path:
-        """The file that predicts."""
-        return self.out / f"{self.mesh.name}.ckpt"
+    def __init__(self, cfg: DictConfig, mesh: Mesh, out: Path, stages: Stages) -> None:
+        self.cfg, self.mesh, self.out, self.stages = cfg, mesh, out, stages
+        self.data, self.training = out / "data", out / "training"  # renders; the run's folder
+        self.weights = out / f"{mesh.name}.ckpt"  # the file that predicts
 
     @cached_property
     def frames(self) -> int:

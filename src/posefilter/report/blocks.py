@@ -5,8 +5,7 @@ Nothing here is HTML, so nothing here needs escaping.
 
 import hashlib
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import ClassVar, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
 from posefilter.report.charts import DARK, LIGHT, WIDTH_PX, Panel, draw_chart, measure_height
 from posefilter.report.images import WIDE_PX, StoredImage, encode_image, encode_png
@@ -26,27 +25,21 @@ class Text(NamedTuple):
 Cell = str | Text
 
 
-@dataclass(frozen=True)
-class Heading:
+class Heading(NamedTuple):
     """A heading within a section."""
 
-    kind: ClassVar = "heading"
     text: str
 
 
-@dataclass(frozen=True)
-class Paragraph:
+class Paragraph(NamedTuple):
     """A paragraph of words in several styles."""
 
-    kind: ClassVar = "paragraph"
     parts: Sequence[Cell]
 
 
-@dataclass(frozen=True)
-class Table:
+class Table(NamedTuple):
     """A table, which scrolls within itself where it is too wide; without rows it is left out."""
 
-    kind: ClassVar = "table"
     head: Sequence[str]  # the columns' names; no head where all are empty
     rows: Sequence[Sequence[Cell]]
     numeric: Sequence[int] = ()  # columns of numbers
@@ -54,11 +47,9 @@ class Table:
     form: str = ""  # how it folds on a phone, or `narrow`; see page.css
 
 
-@dataclass(frozen=True)
-class Fold:
+class Fold(NamedTuple):
     """Blocks that open on demand."""
 
-    kind: ClassVar = "fold"
     title: str
     blocks: Sequence["Block"]
 
@@ -75,11 +66,9 @@ class Chart(NamedTuple):
     png: bytes
 
 
-@dataclass(frozen=True)
-class Charts:
+class Charts(NamedTuple):
     """Charts side by side."""
 
-    kind: ClassVar = "charts"
     charts: Sequence[Chart]
 
 
@@ -98,11 +87,9 @@ class GalleryImage(NamedTuple):
         return self.width >= WIDE_PX
 
 
-@dataclass(frozen=True)
-class Gallery:
+class Gallery(NamedTuple):
     """Images with their captions."""
 
-    kind: ClassVar = "gallery"
     images: Sequence[GalleryImage]
     wide: bool = False
 

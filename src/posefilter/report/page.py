@@ -64,5 +64,5 @@ def open_templates() -> Environment:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    templates.filters["slug"] = make_slug
+    templates.filters |= {"slug": make_slug, "kind": lambda block: type(block).__name__}
     return templates
