@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from posefilter.data.frames import FrameRecord, Sample
+from posefilter.data.readers.decode import read_label
 from posefilter.data.readers.plausible import check_sample, narrow
 from posefilter.data.silhouette import Geometry
 from posefilter.errors import BadData
@@ -50,6 +51,12 @@ class BaseReader:
 
     def others(self, i: int) -> np.ndarray:
         """Return the pixels that the dataset labels as anything but record i.  -> (H, W) bool."""
+        entry = self._entries[i]
+        label = read_label(self._files(entry.record)[2])
+        return (label != 0) & ~self._mask(entry, label)
+
+    def _mask(self, entry: Any, label: np.ndarray) -> np.ndarray:
+        """Return an entry's part of an image of classes, the third of its record's files."""
         raise NotImplementedError
 
     def native_from_mesh(self, name: str) -> np.ndarray:

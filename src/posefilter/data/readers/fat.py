@@ -151,12 +151,6 @@ class FatReader(BaseReader):
         aligned = entry.kind.aligned_from_mesh
         return self._make_sample(i, rgb, depth, mask, camera.K, aligned, files)
 
-    def others(self, i: int) -> np.ndarray:
-        """Return the pixels of any other labeled object.  -> (H, W) bool."""
-        entry = self._entries[i]
-        seg = read_label(self._files(entry.record)[2])
-        return (seg != 0) & ~self._mask(entry, seg)
-
     def _mask(self, entry: _Entry, seg: np.ndarray) -> np.ndarray:
         mask = self._own_part(entry, entry.camera.K, seg == entry.kind.seg_id)
         if mask.any():

@@ -130,12 +130,6 @@ class YCBVideoReader(BaseReader):
         native = self._native[entry.record.object]
         return self._make_sample(i, rgb, depth, mask, entry.K, native, files)
 
-    def others(self, i: int) -> np.ndarray:
-        """Return the pixels of any other labeled object.  -> (H, W) bool."""
-        entry = self._entries[i]
-        label = read_label(self._files(entry.record)[2])
-        return (label != 0) & ~self._mask(entry, label)
-
     def _mask(self, entry: _Entry, label: np.ndarray) -> np.ndarray:
         path = entry.record.files[2]
         if int(label.max()) > len(self._classes):
@@ -200,12 +194,7 @@ class YCBVideoReader(BaseReader):
     def _list_frame(self, scene_id: int, im_id: int, name: str, stem: Path) -> list[_Entry]:
         path = stem.with_name(f"{stem.name}-meta.mat")
         meta = read_meta(check_inside(path, self.root))
-        try:
-            if np.iscomplexobj(meta["cls_indexes"]):
-                raise TypeError("they are complex")
-            indices = np.asarray(meta["cls_indexes"], dtype=np.float64).ravel()
-        except (TypeError, ValueError) as error:
-            raise BadData(path, "'cls_indexes' is not numbers", str(error)) from error
+        indices = numbers(meta, "cls_indexes", path, (np.size(meta["cls_indexes"]),))
         if len(indices) == 0:
             return []
         if not np.isin(indices, np.arange(1, len(self._classes) + 1)).all():

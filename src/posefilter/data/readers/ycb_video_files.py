@@ -14,7 +14,7 @@ from posefilter.data.readers.decode import list_folder
 from posefilter.errors import BadData, UserError
 from posefilter.limits import read_bytes, read_lines
 from posefilter.meshes import ycb
-from posefilter.paths import is_plain_name
+from posefilter.paths import find_list, is_plain_name
 
 FRAME = re.compile(r"[0-9]{1,9}")
 
@@ -58,7 +58,7 @@ def list_scenes(root: Path, subsets: set[str]) -> Iterator[tuple[str, Path]]:
         UserError: A folder of frames in `data` has another name: it would be left out.
     """
     if list_stems(root):
-        yield (SYNTHETIC if root.name == SYNTHETIC else root.name), root
+        yield root.name, root
         return
     if SYNTHETIC in subsets and (root / SYNTHETIC).is_dir():
         yield SYNTHETIC, root / SYNTHETIC
@@ -88,8 +88,7 @@ def list_stems(folder: Path) -> list[str]:
 
 
 def read_frame_list(root: Path, listed: str | Path) -> list[str]:
-    candidates = [Path(listed), root / listed, root / "image_sets" / listed, root.parent / listed]
-    path = next((p for p in candidates if p.is_file()), None)
+    path = find_list(str(listed), root)
     if path is None:
         raise UserError(f"{listed}: no such list of frames (data.options.frames), nor below {root}")
     names = read_lines(path, _LONGEST_LIST)
