@@ -12,11 +12,6 @@ from posefilter.geometry.spaces import PoseSpace
 from posefilter.protocols import Encoding, Method, Space
 from posefilter.types import BeliefBatch, ParticleOutput, Particles
 
-_KERNEL_MASS = (
-    "log of the weight of all particles, each by its kernel at the estimate: at most 0; no "
-    "probability"
-)
-
 
 def select_particle(particles: Particles, output: ParticleOutput, scores: Tensor) -> BeliefBatch:
     """Return the belief of each image's particle of highest score.  scores (B, N)."""
@@ -127,19 +122,23 @@ class DensestMode(BestParticle):
         bandwidth: Of the Gaussian kernel over the particles, in the space's unit ([m] or [px]).
     """
 
-    score_is: ClassVar[str] = _KERNEL_MASS
+    score_is: ClassVar[str] = (
+        "log of the weight of all particles, each by its kernel at the estimate: at most 0; no "
+        "probability"
+    )
+    space: Space | None = None  # in which they are compared; None: the method's
 
     def __init__(self, bandwidth: float) -> None:
         self.bandwidth = bandwidth
 
     def rate(self, particles: Particles, output: ParticleOutput, method: Method) -> Tensor:
         """Return the logs of their kernel masses."""
-        posed = isinstance(method.space, PoseSpace)
-        where = (output.pose if posed else particles.state).detach()
-        return kernel_mass(where, particles.log_weights.detach(), method.space, self.bandwidth)
+        space = method.space if self.space is None else self.space
+        where = (output.pose if isinstance(space, PoseSpace) else particles.state).detach()
+        return kernel_mass(where, particles.log_weights.detach(), space, self.bandwidth)
 
 
-class DensestPose(BestParticle):
+class DensestPose(DensestMode):
     """The particle's pose of highest kernel density among poses, for particles of any space.
 
     Particles that are pixels can predict one pose from distant positions; this estimate compares
@@ -150,12 +149,6 @@ class DensestPose(BestParticle):
         radius: Distance at which a rotation counts as the shift that it causes [m].
     """
 
-    score_is: ClassVar[str] = _KERNEL_MASS
-
     def __init__(self, bandwidth: float, radius: float = 0.1) -> None:
-        self.bandwidth, self.space = bandwidth, PoseSpace((0.0, 0.0, 0.0), radius)
-
-    def rate(self, particles: Particles, output: ParticleOutput, method: Method) -> Tensor:
-        """Return the logs of their poses' kernel masses."""
-        pose, log_weights = output.pose.detach(), particles.log_weights.detach()
-        return kernel_mass(pose, log_weights, self.space, self.bandwidth)
+        super().__init__(bandwidth)
+        self.space = PoseSpace((0.0, 0.0, 0.0), radius)

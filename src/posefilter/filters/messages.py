@@ -25,6 +25,7 @@ from torch import Generator, Tensor
 
 from posefilter.capabilities import Capabilities
 from posefilter.errors import UserError
+from posefilter.filters.resample import normalize_log_weights
 from posefilter.geometry.pose import origin_of, rotation_of
 from posefilter.geometry.spaces import PartsSpace
 from posefilter.protocols import Resample, Space
@@ -138,11 +139,7 @@ class WithinParts:
         ancestors, log_weights = [], []
         old = space.split(particles.log_weights.shape[1])
         for block, new in zip(old, space.split(count), strict=True):
-            log_w = particles.log_weights[:, block]
-            log_part = log_w.logsumexp(1, keepdim=True)
-            # of a part without weight any particle will do
-            log_w = (log_w - log_part).nan_to_num(0.0).log_softmax(1)
-            part = Particles(*(x[:, block] for x in particles))._replace(log_weights=log_w)
+            part, log_part = normalize_log_weights(Particles(*(x[:, block] for x in particles)))
             drawn = self.resampler(part, new.stop - new.start, space, generator)
             if drawn.mixture_weights is not None:
                 raise UserError("filter/resample=within_parts needs a scheme that draws ancestors")

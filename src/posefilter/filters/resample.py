@@ -178,6 +178,14 @@ class AdaptiveResampling:
         return Resampled(ancestors, log_weights, mixture_weights)
 
 
+def normalize_log_weights(particles: Particles) -> tuple[Particles, Tensor]:
+    """Return particles with normalized weights, and the logs of the sums before, (B, 1)."""
+    log_sum = particles.log_weights.logsumexp(1, keepdim=True)
+    # of particles without weight any will do
+    log_w = (particles.log_weights - log_sum).nan_to_num(0.0).log_softmax(1)
+    return particles._replace(log_weights=log_w), log_sum
+
+
 class Islands:
     """Resample within groups of particles that never mix (Verge et al. 2015).
 
@@ -210,19 +218,13 @@ class Islands:
         B, M = particles.log_weights.shape
         most = max(1, min(M, count) // self.size)
         islands = max(n for n in range(1, most + 1) if not (M % n or count % n))
-        log_w = particles.log_weights.reshape(B * islands, M // islands)
-        log_island = log_w.logsumexp(1, keepdim=True)
-        by_island = Particles(
-            *(x.reshape(B * islands, M // islands, *x.shape[2:]) for x in particles)
-        )
-        # of an island without weight any particle will do
-        by_island = by_island._replace(
-            log_weights=(log_w - log_island).nan_to_num(0.0).log_softmax(1)
-        )
+        shape = B * islands, M // islands
+        by_island = Particles(*(x.reshape(*shape, *x.shape[2:]) for x in particles))
+        by_island, log_island = normalize_log_weights(by_island)
         resampled = self.resampler(by_island, count // islands, space, generator)
         if resampled.mixture_weights is not None:
             raise UserError("filter/resample=islands needs a scheme that draws ancestors")
-        first = torch.arange(islands, device=log_w.device)[:, None] * (M // islands)
+        first = torch.arange(islands, device=log_island.device)[:, None] * (M // islands)
         ancestors = resampled.ancestors.view(B, islands, -1) + first
         log_weights = (resampled.log_weights + log_island).view(B, count)
         return Resampled(ancestors.flatten(1), log_weights)
