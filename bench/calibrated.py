@@ -47,7 +47,8 @@ from scipy.stats import kstest
 from posefilter.belief import Belief
 from posefilter.cli.checkpoints import method_of, read_checkpoint
 from posefilter.confidence.belief_scale import DEGREES
-from posefilter.confidence.fit import Frames, fit_calibration
+from posefilter.confidence.conformal import fit_conformal
+from posefilter.confidence.fit import Frames, cross_validate, fit_calibration
 from posefilter.confidence.tolerance import RIGHT, PoseErrors, PoseTolerance, measure_pose_errors
 from posefilter.data.absent import hide_annotation
 from posefilter.data.loaders import make_loader
@@ -262,15 +263,21 @@ def judge_across(
         fold = {scene: k % folds for k, scene in enumerate(order)}
         part = np.array([fold[row["scene"]] for row in own])
         frames = gather_frames(own, leave_out)
+        nonconformity, visibility = (
+            np.array([row.get(key, np.nan) for row in own])
+            for key in ("nonconformity", "visibility")
+        )
         for k in range(folds):
             learned = rng.permutation(np.flatnonzero(part != k))
             shown = frames.present[learned]
             both = [learned[shown == there][:max_frames] for there in (True, False)]
-            made = fit_calibration(frames.select(np.concatenate(both)), "fat")
+            taken = np.concatenate(both)
+            chosen, seen = frames.select(taken), frames.present[taken]
+            made, known = fit_calibration(chosen, "fat"), cross_validate(chosen).probability.numpy()
+            sets = fit_conformal(nonconformity[taken][seen], known[seen], visibility[taken][seen])
             held = np.flatnonzero(part == k)
             values = torch.from_numpy(frames.values[held])
             found, usual = made.assess_features(values, tolerance), made.assess_features(values)
-            assert made.conformal is not None
             each = zip(held, found.presence, found.probability, usual.probability, strict=True)
             for i, *parts in each:
                 presence, said, probability = (float(part) for part in parts)
@@ -278,7 +285,7 @@ def judge_across(
                 if tolerance != RIGHT:
                     row["right"] = bool(tolerance.accepts(PoseErrors(*np.array(row["errors"]))))
                 if row["there"]:
-                    limits = [made.conformal.find_limit(one / 100, probability) for one in SHOWN]
+                    limits = [sets.find_limit(one / 100, probability) for one in SHOWN]
                     row["held"] = [row["nonconformity"] <= limit for limit in limits]
                 out.append(row)
     return out
@@ -289,11 +296,9 @@ def gather_frames(rows: Sequence[Row], leave_out: Sequence[str]) -> Frames:
     names = tuple(name for name in rows[0]["features"] if name not in leave_out)
     values = np.array([[row["features"][name] for name in names] for row in rows])
     there, right = (np.array([row[key] for row in rows]) for key in ("there", "right"))
-    nonconformity = np.array([row.get("nonconformity", np.nan) for row in rows])
     known = all("errors" in row for row in rows)  # not in rows of earlier versions
     errors = PoseErrors(*np.array([row["errors"] for row in rows]).T) if known else None
-    visibility = np.array([row.get("visibility", np.nan) for row in rows])
-    return Frames(names, values, there, right, nonconformity, errors, visibility)
+    return Frames(names, values, there, right, errors)
 
 
 def share(hits: Sequence[Any]) -> str:

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 import torch
 
-from posefilter.confidence.calibration import read_calibration
+from posefilter.confidence.calibration import Calibration, read_calibration
 from posefilter.confidence.conformal import Conformal, choose_edges, fit_conformal
-from posefilter.confidence.fit import Frames, fit_calibration
+from posefilter.confidence.fit import Frames, cross_validate, fit_calibration
 from posefilter.errors import UserError
 from posefilter.geometry.pose import make_pose, move_about
 from posefilter.geometry.rotation import random_rotation
@@ -36,12 +36,14 @@ def test_coverage_on_exchangeable_frames_is_at_least_the_level_and_hardly_more(
         surface = rng.random(2 * count + 1)
         # of the second group a belief is far too sure, of the first too wide
         nonconformity = rng.standard_t(3, size=2 * count + 1) * np.where(surface < 0.25, 1, 50)
-        found = fit_conformal(nonconformity[1:], surface[1:])
+        group = surface[1:] >= 0.25
+        own = (np.sort(nonconformity[1:][group == k]).tolist() for k in (False, True))
+        found = Conformal((0.25,), tuple(map(tuple, own)))
         limit = found.find_limit(level, surface[0])
         covered[found.find_group(surface[0])].append(bool(nonconformity[0] <= limit))
-    for own in covered:
-        error = math.sqrt(0.25 / len(own))
-        assert level - 3 * error < np.mean(own)
+    for hits in covered:
+        error = math.sqrt(0.25 / len(hits))
+        assert level - 3 * error < np.mean(hits)
     assert np.mean(covered[1]) < level + 0.06
 
 
@@ -73,10 +75,10 @@ def test_occluded_frames_raise_the_limit_where_they_are_enough_for_the_level() -
 
 def test_frames_of_unknown_visibility_are_not_occluded() -> None:
     seen = np.array([0.1, math.nan, 0.25, 0.2])
-    found = fit_conformal(np.array([4.0, 3.0, 2.0, 1.0]), np.full(4, 0.5), (), "surface", seen)
+    found = fit_conformal(np.array([4.0, 3.0, 2.0, 1.0]), np.full(4, 0.5), seen)
     assert found.occluded == ((1.0, 4.0),)
     assert found.scores == ((1.0, 2.0, 3.0, 4.0),)
-    assert fit_conformal(np.zeros(4), np.full(4, 0.5), ()).occluded == ()
+    assert fit_conformal(np.zeros(4), np.full(4, 0.5)).occluded == ()
 
 
 @pytest.mark.parametrize("level", [0.5, 0.8])
@@ -92,9 +94,8 @@ def test_sets_hold_the_truth_of_occluded_frames_that_the_probability_does_not_te
         seen = rng.choice([0.1, 0.9], size=161, p=[0.3, 0.7])
         scores = rng.normal(size=161) + np.where(seen < 0.25, 3.0, 0.0)
         for known, own in covered.items():
-            values = np.full(160, 0.5)
             visibility = seen[1:] if known else None
-            found = fit_conformal(scores[1:], values, (), "probability", visibility)
+            found = fit_conformal(scores[1:], np.full(160, 0.5), visibility)
             hit = bool(scores[0] <= found.find_limit(level, 0.5))
             own[bool(seen[0] < 0.25)].append(hit)
     assert np.mean(covered[False][True]) < level - 0.2
@@ -158,31 +159,39 @@ def test_coverage_is_counted_by_quarter_of_visibility() -> None:
     assert [one["coverage"][at] for one in curves["quarters"]] == [1, 0, 1]
 
 
-def frames(count: int = 60) -> Frames:
+def frames(count: int = 60) -> tuple[Frames, np.ndarray]:
+    """Return frames, and the nonconformity (n,) of their truths, NaN without the object."""
     rng = np.random.default_rng(3)
     there = np.arange(count) < count // 2
     nonconformity = np.where(there, rng.normal(size=count), np.nan)
-    return Frames(
+    drawn = Frames(
         ("surface", "score"),
         rng.random((count, 2)),
         there,
         there & (rng.random(count) < 0.5),
-        nonconformity,
         visibility=np.where(there, rng.random(count), np.nan),
     )
+    return drawn, nonconformity
+
+
+def fit(drawn: Frames, nonconformity: np.ndarray) -> tuple[Calibration, Conformal]:
+    """Return a calibration with sets, and these: by cross-validation, as calibrate.py does."""
+    own, held = drawn.present, cross_validate(drawn).probability.numpy()
+    visibility = None if drawn.visibility is None else drawn.visibility[own]
+    sets = fit_conformal(nonconformity[own], held[own], visibility)
+    return replace(fit_calibration(drawn, "scenes"), conformal=sets), sets
 
 
 def test_a_calibration_carries_the_scores_of_the_frames_with_the_object() -> None:
-    made = fit_calibration(frames(), "scenes")
-    assert made.conformal is not None
-    own = frames()
-    assert sum(made.conformal.scores, ()) != ()
-    together = sorted(x for group in made.conformal.scores for x in group)
-    assert together == sorted(own.nonconformity[own.present].tolist())  # type: ignore[index]
+    own, nonconformity = frames()
+    made, sets = fit(own, nonconformity)
+    assert sum(sets.scores, ()) != ()
+    together = sorted(x for group in sets.scores for x in group)
+    assert together == sorted(nonconformity[own.present].tolist())
     assert read_calibration(made.to_plain(), "x") == made
-    occluded = sorted(x for group in made.conformal.occluded for x in group)
+    occluded = sorted(x for group in sets.occluded for x in group)
     assert own.visibility is not None
-    assert occluded == sorted(own.nonconformity[own.visibility < 0.25].tolist())  # type: ignore[index]
+    assert occluded == sorted(nonconformity[own.visibility < 0.25].tolist())
     assert occluded
     earlier = made.to_plain()
     del earlier["conformal"]
@@ -190,13 +199,15 @@ def test_a_calibration_carries_the_scores_of_the_frames_with_the_object() -> Non
 
 
 def test_what_an_earlier_version_stored_is_grouped_by_surface() -> None:
-    content = fit_calibration(frames(), "scenes").to_plain()
+    content = fit_calibration(frames()[0], "scenes").to_plain()
     content["conformal"] = {"edges": [0.25], "surprises": [[1.0], [2.0]]}
     read = read_calibration(content, "x").conformal
     assert read == Conformal((0.25,), ((1.0,), (2.0,)), "surface")
 
 
-def draw_hard_and_easy(count: int, rng: np.random.Generator) -> tuple[Frames, np.ndarray]:
+def draw_hard_and_easy(
+    count: int, rng: np.random.Generator
+) -> tuple[Frames, np.ndarray, np.ndarray]:
     """Draw frames whose truths conform the less the less is seen, which is a hidden number."""
     seen = rng.random(count)
     there = rng.random(count) < 0.6
@@ -204,7 +215,7 @@ def draw_hard_and_easy(count: int, rng: np.random.Generator) -> tuple[Frames, np
     right = there & (rng.random(count) < 1 / (1 + np.exp(-12 * (seen - 0.4))))
     scale = np.where(seen < 0.4, 8.0, 1.0)
     nonconformity = np.where(there, scale * rng.standard_t(4, size=count), np.nan)
-    return Frames(("coordinates", "score"), values, there, right, nonconformity), seen
+    return Frames(("coordinates", "score"), values, there, right), nonconformity, seen
 
 
 @pytest.mark.parametrize("level", [0.5, 0.8, 0.9, 0.95])
@@ -214,17 +225,15 @@ def test_groups_by_probability_cover_the_hard_frames_as_often_as_the_easy_ones(
     rng = np.random.default_rng(4)
     held: dict[str, list[np.ndarray]] = {"hard": [], "easy": []}
     for _ in range(12):
-        made = fit_calibration(draw_hard_and_easy(650, rng)[0], "scenes")
-        assert made.conformal is not None
-        assert made.conformal.by == "probability"
-        assert len(made.conformal.scores) in (5, 6)
-        assert all(18 < len(own) < 150 for own in made.conformal.scores)
-        new, seen = draw_hard_and_easy(2000, rng)
+        made, sets = fit(*draw_hard_and_easy(650, rng)[:2])
+        assert sets.by == "probability"
+        assert len(sets.scores) in (5, 6)
+        assert all(18 < len(own) < 150 for own in sets.scores)
+        new, nonconformity, seen = draw_hard_and_easy(2000, rng)
         own = new.present
-        assert new.nonconformity is not None
         probability = made.assess_features(torch.from_numpy(new.values[own])).probability
-        limit = [made.conformal.find_limit(level, float(p)) for p in probability]
-        inside = new.nonconformity[own] <= np.array(limit)
+        limit = [sets.find_limit(level, float(p)) for p in probability]
+        inside = nonconformity[own] <= np.array(limit)
         held["hard"].append(inside[seen[own] < 0.3])
         held["easy"].append(inside[seen[own] > 0.6])
     share = {name: float(np.concatenate(rows).mean()) for name, rows in held.items()}
@@ -262,6 +271,6 @@ def test_few_frames_are_one_group() -> None:
     ],
 )
 def test_scores_that_are_none_are_refused(wrong: object) -> None:
-    content = fit_calibration(frames(), "scenes").to_plain() | {"conformal": wrong}
+    content = fit_calibration(frames()[0], "scenes").to_plain() | {"conformal": wrong}
     with pytest.raises(UserError, match="checkpoint=x: its calibration"):
         read_calibration(content, "checkpoint=x")

@@ -32,7 +32,7 @@ from posefilter.confidence.belief_scale import (
     measure_spread,
 )
 from posefilter.confidence.calibration import Assessment, Calibration
-from posefilter.confidence.conformal import LITTLE_VISIBLE, choose_edges, fit_conformal
+from posefilter.confidence.conformal import LITTLE_VISIBLE, fit_conformal
 from posefilter.confidence.fit import (
     FEWEST,
     Frames,
@@ -62,6 +62,7 @@ from posefilter.types import Batch, BeliefBatch, ObjectModel, Trace
 
 _BATCH = 8  # images
 _PAUSE = 30.0  # between lines of progress [s]
+_FOLDS = 5  # parts of the frames, each of whose beliefs the others calibrate
 _Item = TypeVar("_Item")
 _SHOWN = ("auroc", "auroc_presence", "ece", "brier", "found", "false_alarms")
 
@@ -270,8 +271,7 @@ def learn_sets(method: PoseEstimator, present: Sequence[FrameDataset], console: 
     found = calibration.assess(dict(zip(frames.features, columns, strict=True)))
     beliefs, _ = method.calibrate_belief(beliefs, found)
     scores = score_truth(beliefs, truth, method.object_model).nonconformity.numpy()
-    held = found.probability.numpy()
-    sets = fit_conformal(scores, held, choose_edges(held), "probability", frames.visibility)
+    sets = fit_conformal(scores, found.probability.numpy(), frames.visibility)
     return replace(calibration, conformal=sets)
 
 
@@ -295,13 +295,15 @@ def fit_answers(
     scores = measure_quality(frames, held)
     quality = {key: float(scores[key]) for key in _SHOWN if math.isfinite(scores[key])}
     own = frames.present
-    nonconformity = np.full(len(own), np.nan)
+    probability = held.probability[own]
     features = torch.from_numpy(standardize_frames(frames, first)[own])
-    scale, nonconformity[own] = fit_beliefs(
-        beliefs, held.probability[own], features, frames.correct[own], object_model
+    scale, nonconformity = fit_beliefs(
+        beliefs, probability, features, frames.correct[own], object_model
     )
-    frames = frames._replace(nonconformity=nonconformity)
-    return fit_calibration(frames, source, quality, first, scale)
+    fitted = fit_calibration(frames, source, quality, first)
+    visibility = None if frames.visibility is None else frames.visibility[own]
+    sets = fit_conformal(nonconformity, probability.numpy(), visibility)
+    return replace(fitted, belief_scale=scale, conformal=sets)
 
 
 def fit_beliefs(
@@ -310,8 +312,6 @@ def fit_beliefs(
     features: Tensor,
     right: np.ndarray,
     object_model: ObjectModel,
-    folds: int = 5,
-    seed: int = 0,
 ) -> tuple[BeliefScale | None, np.ndarray]:
     """Return the scale of beliefs, and the nonconformity of the truths under calibrated beliefs.
 
@@ -321,13 +321,11 @@ def fit_beliefs(
         features: (n, F) of each, standardized.
         right: (n,) bool, whether the estimate is right.
         object_model: The object.
-        folds: Each frame's belief is calibrated by a fit to the other parts, or to all where these
-            have too few right estimates.
-        seed: Of their shuffle.
 
     Returns:
         The scale of all frames, None where too few are right; and (n,) [nat], of the beliefs as
-        the filter leaves them where there is no scale.
+        the filter leaves them where there is no scale. Each frame's belief is calibrated by a fit
+        to the other folds, or to all where these have too few right estimates.
     """
     spread = measure_spread(*beliefs, object_model)
 
@@ -336,10 +334,10 @@ def fit_beliefs(
         own = PoseSpread(*(x[index] for x in spread))
         return fit_belief_scale(own, probability[index], features[index])
 
-    fold = np.random.default_rng(seed).permutation(len(right)) % folds
+    fold = np.random.default_rng(0).permutation(len(right)) % _FOLDS
     nonconformity = np.full(len(right), np.nan)
     whole = fit(np.arange(len(right)))
-    for k in range(folds):
+    for k in range(_FOLDS):
         held = np.flatnonzero(fold == k)
         if not len(held):
             continue

@@ -49,9 +49,6 @@ LITTLE_VISIBLE = 0.25  # a frame with less counts for the second limit of its gr
 # that a second limit takes at least: frames of a group, and their share of it, since where they are
 # rare it would only make the sets of all others larger
 _FEWEST_OCCLUDED, _LEAST_OCCLUDED = 5, 0.2
-# of the feature `surface`: about half of an object's surface faces the camera, so that below a
-# quarter the depth shows less than half of what could be seen
-EDGES = (0.25,)
 
 
 @dataclass(frozen=True)
@@ -117,23 +114,18 @@ def choose_edges(probability: np.ndarray) -> tuple[float, ...]:
 
 
 def fit_conformal(
-    scores: np.ndarray,
-    values: np.ndarray,
-    edges: Sequence[float] = EDGES,
-    by: By = "surface",
-    visibility: np.ndarray | None = None,
+    scores: np.ndarray, probability: np.ndarray, visibility: np.ndarray | None = None
 ) -> Conformal:
-    """Sort the nonconformity scores of calibration frames into groups.
+    """Sort the nonconformity scores of calibration frames into groups by their probabilities.
 
     Args:
         scores: (n,) of the truths [nat].
-        values: (n,) that feature of the frames, or probabilities.
-        edges: Limits between groups, chosen without looking at the scores.
-        by: What the values are.
+        probability: (n,) of the frames.
         visibility: (n,) of the object in the frames; NaN where it is not known. None: of no frame.
     """
-    empty = Conformal(tuple(edges), ((),) * (len(edges) + 1))
-    group = np.array([empty.find_group(float(one)) for one in values], dtype=int)
+    edges = choose_edges(probability)  # without looking at the scores
+    empty = Conformal(edges, ((),) * (len(edges) + 1))
+    group = np.array([empty.find_group(float(one)) for one in probability], dtype=int)
 
     def sort(some: np.ndarray) -> tuple[tuple[float, ...], ...]:
         own = (np.sort(scores[some & (group == k)]) for k in range(len(edges) + 1))
@@ -142,4 +134,4 @@ def fit_conformal(
     whole = sort(np.ones(len(scores), dtype=bool))
     known = visibility is not None
     occluded = sort(np.asarray(visibility) < LITTLE_VISIBLE) if known else ()
-    return Conformal(empty.edges, whole, by, occluded)
+    return Conformal(edges, whole, "probability", occluded)

@@ -7,9 +7,7 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
-from posefilter.confidence.belief_scale import BeliefScale
 from posefilter.confidence.calibration import Assessment, Calibration, standardize, tabulate_errors
-from posefilter.confidence.conformal import choose_edges, fit_conformal
 from posefilter.confidence.logistic import fit_logistic
 from posefilter.confidence.tolerance import RIGHT, PoseErrors
 from posefilter.errors import UserError
@@ -28,9 +26,6 @@ class Frames(NamedTuple):
     values: np.ndarray  # (n, F)
     present: np.ndarray  # (n,) bool: the object is in the image
     correct: np.ndarray  # (n,) bool: and the estimate within 0.1 diameters
-    # (n,) of the true pose under the calibrated belief, NaN where the object is not in the image
-    # [nat]; None: not measured
-    nonconformity: np.ndarray | None = None
     # of (n,) each, NaN where the object is not in the image; None: not measured
     errors: PoseErrors | None = None
     # (n,) share of the object that is visible, NaN where it is not in the image or not known; None:
@@ -39,12 +34,10 @@ class Frames(NamedTuple):
 
     def select(self, index: np.ndarray) -> "Frames":
         """Return some of the frames."""
-        nonconformity, visibility = (
-            None if one is None else one[index] for one in (self.nonconformity, self.visibility)
-        )
+        visibility = None if self.visibility is None else self.visibility[index]
         errors = None if self.errors is None else PoseErrors(*(x[index] for x in self.errors))
         own = (self.values[index], self.present[index], self.correct[index])
-        return Frames(self.features, *own, nonconformity, errors, visibility)
+        return Frames(self.features, *own, errors, visibility)
 
 
 def make_frames(
@@ -61,7 +54,7 @@ def make_frames(
     all_rows, seen = (np.concatenate(one) for one in (rows, present))
     all_rows[~np.isfinite(all_rows)] = np.nan  # no number
     off = PoseErrors(*(np.concatenate(parts) for parts in zip(*errors, strict=True)))
-    return Frames(names, all_rows, seen, RIGHT.accepts(off), None, off, np.concatenate(visibility))
+    return Frames(names, all_rows, seen, RIGHT.accepts(off), off, np.concatenate(visibility))
 
 
 def fit_choice(frames: Frames, source: str) -> Calibration:
@@ -95,7 +88,6 @@ def fit_calibration(
     source: str,
     quality: Mapping[str, float] | None = None,
     first: Calibration | None = None,
-    belief_scale: BeliefScale | None = None,
 ) -> Calibration:
     """Fit both regressions.
 
@@ -108,22 +100,12 @@ def fit_calibration(
         quality: Of held-out predictions.
         first: What the answers were chosen by, see `fit_choice`; features are standardized as it
             does. None: they are first answers, and no others are searched for.
-        belief_scale: What the beliefs were calibrated by that `nonconformity` is of.
 
     Raises:
         UserError: There are too few frames with the object, or without.
     """
     _check_counts(frames)
-    fitted = replace(_fit(frames, source, quality or {}, first), belief_scale=belief_scale)
-    if frames.nonconformity is None:
-        return fitted
-    own = frames.present
-    held = cross_validate(frames, first=first).probability.numpy()[own]
-    visibility = None if frames.visibility is None else frames.visibility[own]
-    sets = fit_conformal(
-        frames.nonconformity[own], held, choose_edges(held), "probability", visibility
-    )
-    return replace(fitted, conformal=sets)
+    return _fit(frames, source, quality or {}, first)
 
 
 def _check_counts(frames: Frames) -> None:
