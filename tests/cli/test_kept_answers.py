@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
+from omegaconf import OmegaConf
 from tests.data.dataset_trees import bop_scene, pose
 
 from posefilter.checking.check import check_dataset
@@ -14,7 +15,7 @@ from posefilter.cli import run_command
 from posefilter.cli.checkpoints import check_once
 from posefilter.cli.doubts import say_doubt
 from posefilter.cli.predict import list_rows
-from posefilter.cli.preflight import _SWITCHES
+from posefilter.cli.preflight import check_files
 from posefilter.cli.track_log import check_unused
 from posefilter.data.readers.registry import open_reader
 from posefilter.errors import UserError
@@ -86,8 +87,9 @@ def test_a_picture_of_an_earlier_dataset_is_no_part_of_a_report(tmp_path: Path) 
 def test_every_switch_takes_true_and_false_alone(file: Path) -> None:
     """A text such as "no" would count as true."""
     settings = yaml.safe_load(file.read_text())
-    switches = {key for key, value in settings.items() if isinstance(value, bool)}
-    assert switches == {*_SWITCHES.get(file.stem, ())}
+    for switch in (key for key, value in settings.items() if isinstance(value, bool)):
+        with pytest.raises(UserError, match=f"^{switch}=no: choose true or false$"):
+            check_files(file.stem, OmegaConf.create({**settings, switch: "no"}))
 
 
 def test_a_doubt_is_said_once_whatever_its_numbers(capfd: pytest.CaptureFixture[str]) -> None:

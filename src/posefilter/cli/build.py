@@ -18,13 +18,12 @@ from posefilter.callbacks.tensorboard_layout import TensorBoardLayout
 from posefilter.cli.comparing import comparable
 from posefilter.cli.console import JSON
 from posefilter.cli.files import WholeCheckpoints
-from posefilter.cli.final_validation import FinalValidation
 from posefilter.cli.instantiate import instantiate
 from posefilter.cli.job import Job
 from posefilter.cli.plain import key_of, resolve
 from posefilter.cli.progress_bar import progress
 from posefilter.cli.ranks import is_follower
-from posefilter.cli.stopping import Stop
+from posefilter.cli.stopping import FinalValidation, Stop
 from posefilter.data.module import PoseDataModule
 from posefilter.devices import choose_device
 from posefilter.errors import UserError

@@ -7,8 +7,10 @@ from typing import Any
 from omegaconf import DictConfig, OmegaConf
 
 from posefilter.cli.arguments import TYPED
+from posefilter.cli.choices import read_settings
 from posefilter.cli.plain import find, unresolved
 from posefilter.errors import UserError, missing_package
+from posefilter.paths import find_conf
 from posefilter.weights import expand_weights, find_weights, is_several
 
 # by command: settings that name a file to be read
@@ -26,14 +28,6 @@ _FOLDERS = {
 }
 _ONE_IMAGE = "is a folder; predict takes one image, and track frames=DIR a folder of them"
 _IS_FOLDER = {"rgb": _ONE_IMAGE, "depth": _ONE_IMAGE, "estimates": "is a folder; name a file in it"}
-_SWITCHES = {
-    "calibrate": ("overwrite", "sets_only"),
-    "convert_bag": ("rectify", "track", "copy_messages"),
-    "export": ("quantize",),
-    "generate": ("stereo", "settle", "progress"),
-    "predict": ("save_rerun",),
-    "track": ("save_rerun",),
-}
 # by the class of a logger: the package that it needs, which is an extra of ours by the same name
 _LOGGERS = {
     "lightning.pytorch.loggers.MLFlowLogger": "mlflow",
@@ -59,8 +53,9 @@ def check_files(command: str, cfg: DictConfig) -> None:
 
     Raises UserError, naming the setting, where a file or folder is missing.
     """
-    for key in _SWITCHES.get(command, ()):
-        if not isinstance(cfg[key], bool):  # a text such as "no" would count as true
+    for key, default in read_settings(find_conf(), command).items():
+        # a text such as "no" would count as true
+        if isinstance(default, bool) and not isinstance(cfg[key], bool):
             raise UserError(f"{key}={cfg[key]}: choose true or false")
     if command == "predict":
         _check_rerun(cfg)

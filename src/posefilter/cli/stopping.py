@@ -1,4 +1,6 @@
-"""Ctrl-C and SIGTERM: a training stops where it can go on from, with a checkpoint written there."""
+"""When a training stops: after its last step, which is validated, too; and at Ctrl-C or SIGTERM
+where it can go on from, with a checkpoint written there.
+"""
 
 import signal
 import threading
@@ -10,6 +12,17 @@ from typing import Any
 from lightning import Callback, Trainer
 
 from posefilter.errors import Stopped
+
+
+class FinalValidation(Callback):
+    """Validate after the step that ends a training, too: Lightning validates at multiples of
+    `val_check_interval` alone, so that the best checkpoint could hold no later step.
+    """
+
+    def on_train_batch_end(self, trainer: Trainer, *_: Any) -> None:
+        """Stop at the last step, as Lightning would by itself; before a stop it validates."""
+        if 0 < trainer.max_steps <= trainer.global_step:
+            trainer.should_stop = True
 
 
 class Stop(Callback):

@@ -134,8 +134,6 @@ def follow(
     """Track the objects through one video, write its pictures, and log its rows as they come."""
     shown = estimator.objects if video.objects is None else video.objects
     methods = [method for method in estimator.methods if method.object_model.name in shown]
-    if not methods:
-        return
     tracker = Tracker(Estimator(methods), settings, cfg.seed, threads)
     say(cfg.console, "video", f"{video.name}: {len(video)} frames", video=video.name)
     for name in video.several:

@@ -130,7 +130,9 @@ class State(NamedTuple):
 
 
 class TrackSnapshot(NamedTuple):
-    """All that a track remembers, so that another process can go on with it."""
+    """All that a track remembers, so that another process can go on with it: the generator's state,
+    then attributes of `Track` by their names.
+    """
 
     random: Tensor  # state of the generator
     state: State | None
@@ -203,20 +205,14 @@ class Track:
     @property
     def snapshot(self) -> TrackSnapshot:
         """What the next frame depends on."""
-        return TrackSnapshot(
-            self.generator.get_state(),
-            self.state,
-            self.loss_detector,
-            self.frames,
-            self.apparent_size,
-            self.rotation_margin,
-        )
+        others = (getattr(self, name) for name in TrackSnapshot._fields[1:])
+        return TrackSnapshot(self.generator.get_state(), *others)
 
     @snapshot.setter
     def snapshot(self, snapshot: TrackSnapshot) -> None:
         self.generator.set_state(snapshot.random)
-        self.state, self.loss_detector, self.frames = snapshot[1:4]
-        self.apparent_size, self.rotation_margin = snapshot[4:]
+        for name in TrackSnapshot._fields[1:]:
+            setattr(self, name, getattr(snapshot, name))
 
     @property
     def estimated_cost(self) -> float:
