@@ -33,6 +33,7 @@ NAMED = ("model", "variant", "experiment", "sweep", "seed", "checkpoint")  # hav
 # these change no result
 SILENT = ("logger", "callbacks", "hydra", "out", "resume", "console", "threads")
 SILENT_KEYS = ("data.root", "data.meshes", "data.workers", "data.generate.workers")
+BY_VISIBILITY = {"shipped"}  # tables that have rows of ranges of visibility
 ORDER = {ablation.name: number for number, ablation in enumerate(ABLATIONS)}
 ROW = ("table", "method", "variant", "changed", "seed")  # what tells a row from others
 Run = dict[str, Any]
@@ -117,9 +118,23 @@ def read_figure(run: Run, read: Callable[[Run], float | None]) -> float | None:
     return float(value) if isinstance(value, int | float) and value == value else None
 
 
+def split_by_visibility(run: Run) -> list[Run]:
+    """Return a run and, as runs of their own, its ranges of visibility."""
+    ranges = (run.get("by_visibility") or {}).items()
+    of_all = ("model", "variant", "seed", "device", "versions")
+    kept = {key: run[key] for key in of_all if key in run}
+    parts = [
+        kept | errors | {"choices": run["choices"] | {"visibility": name}}
+        for name, errors in ranges
+    ]
+    return [run, *parts]
+
+
 def make_rows(table: str, runs: Iterable[Run]) -> list[dict[str, str]]:
     """Return a table's runs as rows: figures to six digits, empty where a run has none."""
     rows = []
+    if table in BY_VISIBILITY:
+        runs = [part for run in runs for part in split_by_visibility(run)]
     for run in runs:
         figures = {name: read_figure(run, read) for name, read in COLUMNS.items()}
         rows.append(

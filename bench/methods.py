@@ -13,6 +13,7 @@ handed to every command.
 """
 
 import math
+import re
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -59,6 +60,7 @@ END_TO_END = (
 )
 # kernels of the true pose three and four times as wide as the default's
 WIDE = "loss.terms.pose.translation_mm=60 loss.terms.pose.rotation_deg=40"
+VALUES = re.compile(r",(?![^\[{]*[\]}])")  # between values of a sweep: a list or a dict is one
 TRAIN_RESAMPLE = "filter/resample@model.train_filter.resample"
 
 
@@ -156,14 +158,20 @@ def plan(meshes: str | None = None, frames: str | None = None) -> list[Line]:
     if meshes:
         box = f"{FOUR} experiment=cracker_box_pixels data.meshes={meshes} seed=0"
         lines.append(Line("cracker_box", box))
+        # the scenes of the lines above, dealt as for them
+        renders = (
+            f"data=fat data.root=outputs/data/003_cracker_box data.meshes={meshes} "
+            "data.min_visibility_test=0.3 data.split={train:0.7407,val:0.0741,test:0.1852}"
+        )
+        lines.append(Line("shipped", renders, SHIPPED, "renders"))
     if meshes and frames:
         real = f"data=ycb_video data.root={frames} data.meshes={meshes}"
         runs = {
             model: f"cracker_box/experiment=cracker_box_pixels,model={model},seed=0"
             for model in MODELS
         }
-        runs["pose_pf"] = SHIPPED
         lines += [Line("real_frames", real, run, model) for model, run in runs.items()]
+        lines.append(Line("shipped", real, SHIPPED, "photographs"))
     if meshes:
         lines += [*list_other_objects(meshes, frames), *list_pose_on_photographs(meshes, frames)]
     return lines
@@ -549,7 +557,7 @@ def waits(line: Line, root: Path) -> bool:
     made = checkpoint.stat().st_mtime
     found = (root / line.table / line.into).glob("*/metrics.json")
     done = sum(path.stat().st_mtime > made for path in found)
-    return done >= math.prod(len(word.split("=", 1)[1].split(",")) for word in line.words.split())
+    return done >= math.prod(len(VALUES.split(word)) for word in line.words.split())
 
 
 def main() -> int:

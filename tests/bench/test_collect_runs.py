@@ -90,3 +90,21 @@ def test_a_folder_without_runs_is_refused(
     assert collect.main() == 1
     assert "holds no run" in capsys.readouterr().err
     assert not into.exists()
+
+
+def test_ranges_of_visibility_become_rows_of_a_table_that_shows_them(
+    collect: ModuleType, tmp_path: Path
+) -> None:
+    write_run(tmp_path / "a", 0.9, "model=pose_pf", "data=fat")
+    path = tmp_path / "a" / "metrics.json"
+    range_of = {"0.3-0.5": {"instances": 7, "add": {"auc": 30.0}}}
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"by_visibility": range_of}))
+    runs = collect.read_runs(tmp_path)
+    rows = collect.make_rows("shipped", runs)
+    found = [(row["method"], row["changed"], row["ADD AUC"], row["seed"]) for row in rows]
+    assert found == [
+        ("pose_pf", "data=fat", "40", "0"),
+        ("pose_pf", "data=fat visibility=0.3-0.5", "30", "0"),
+    ]
+    assert rows[1]["box IoU"] == "", "a figure of the whole run alone"
+    assert len(collect.make_rows("other", runs)) == 1
