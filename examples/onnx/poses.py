@@ -29,7 +29,10 @@ def open_export(folder, threads):
 def take_image(settings, rgb, depth, intrinsics):
     """An image as `encode` reads it: RGB (H, W, 3) uint8, depth (H, W) [m], (3, 3)."""
     size = (settings["camera"][1], settings["camera"][0])
-    if rgb.shape[:2] != size or depth.shape != size:
+    if depth.shape != rgb.shape[:2]:
+        color, deep = ("x".join(map(str, x.shape[1::-1])) for x in (rgb, depth))
+        sys.exit(f"the image has {color} pixels, its depth {deep}")
+    if depth.shape != size:
         sys.exit(f"exported for images of {size[1]}x{size[0]}: export with width=, height=")
     depth = np.float32(np.where(depth < 100, depth, 0))  # what is farther is not measured
     known = depth[depth > 0]

@@ -146,6 +146,10 @@ def build(config: DictConfig, data: "PoseDataModule | None" = None) -> PoseEstim
         UserError: A setting does not fit; the message names it.
     """
     _check_config(config, "model")
+    if data is not None and not hasattr(data, "object_to_learn"):
+        raise UserError(
+            f"data: is a {type(data).__name__}; give what posefilter.build_data returns"
+        )
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(int(config.seed))
         method = build_method(recipe(Job(config, {}, [], Path(), "train", False)))

@@ -1,6 +1,7 @@
 """What is there is not overwritten, and a command that fails at once leaves nothing."""
 
 import json
+import shlex
 from pathlib import Path
 
 import pytest
@@ -50,6 +51,14 @@ def test_a_folder_with_results_is_refused_before_anything_is_written(
     (line,) = capfd.readouterr().err.splitlines()
     assert line.startswith(f"{command}: out={run}: {told}")
     assert contents(run) == before
+
+
+def test_advice_on_a_folder_with_a_blank_can_be_typed(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    run = fill(tmp_path / "my run", command="train")
+    assert run_command("train", HOME, ["data.root=/nonexistent", f"out={run}"]) == 2
+    assert shlex.split(capfd.readouterr().err)[-1] == f"resume={run}"
 
 
 def test_what_a_run_found_is_set_aside_before_its_first_evaluation(tmp_path: Path) -> None:

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from tests.data.dataset_trees import bop_scene, pose, write_mesh
 
-from posefilter.data.absent import find_absent, hide_annotation
+from posefilter.data.absent import deal_images, find_absent, hide_annotation
 from posefilter.data.frames import FrameRecord
 from posefilter.data.loaders import make_loader
 from posefilter.data.module import PoseDataModule
@@ -121,6 +121,30 @@ def test_an_image_counts_once_and_only_where_the_object_is_not_listed() -> None:
     names = {part: find_absent(everything, own, both, part, "box") for part in ("val", "test")}
     assert [one.name for one in names["val"]] == ["a/1", "c/0"]
     assert [one.name for one in names["test"]] == ["d/0", "e/0"]
+
+
+@pytest.mark.parametrize("parts", [("train", "val", "test"), ("val", "test")])
+def test_splits_of_one_scene_share_no_image_without_the_object(parts: tuple[str, ...]) -> None:
+    def records(group: str, numbers: range) -> list[FrameRecord]:
+        return [FrameRecord(f"{group}/{n:02d}", group, 0, n, 1, "can", n, ()) for n in numbers]
+
+    found = [*records("b", range(3)), *records("a", range(20, 40))]
+    sizes = {"train": 5, "val": 3, "test": 2}
+    cut, first = {part: list[FrameRecord]() for part in sizes}, 0
+    for part in parts:
+        cut[part] = records("a", range(first, first + sizes[part]))
+        first += sizes[part]
+    dealt = {part: [one.name for one in deal_images(found, cut, part)] for part in parts}
+    here = {part: {name for name in names if name[0] == "a"} for part, names in dealt.items()}
+    assert set().union(*here.values()) == {one.name for one in found[3:]}
+    assert sum(map(len, here.values())) == 20
+    whole = sum(sizes[part] for part in parts)
+    assert {part: len(names) for part, names in here.items()} == {
+        part: 20 * sizes[part] // whole for part in parts
+    }
+    assert all(names[:3] == ["b/00", "b/01", "b/02"] for names in dealt.values()), "of no split"
+    again = cut | {"train": cut["test"]}  # data.split={train: test}
+    assert len(deal_images(found, again, "test")) == 3 + 20 * 2 // 5
 
 
 def test_images_that_annotate_one_class_each_may_show_others(

@@ -89,7 +89,7 @@ WRONG = {
     "classes of text": ({"cls_indexes": lambda m: np.array(["box"])}, "cls_indexes"),
     "classes complex": ({"cls_indexes": lambda m: m + 1j}, "complex"),
     "poses complex": ({"poses": lambda m: m + 1j}, "complex"),
-    "classes NaN": ({"cls_indexes": lambda m: m * np.nan}, "unknown class"),
+    "classes NaN": ({"cls_indexes": lambda m: m * np.nan}, "holds NaN"),
 }
 
 

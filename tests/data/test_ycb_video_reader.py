@@ -198,3 +198,10 @@ def test_a_scene_that_is_not_numbered_is_not_left_out_without_a_word(tmp_path):
     assert [record.name for record in one.records()] == ["kitchen/000001"]
     (tmp_path / "data" / "kitchen").rename(tmp_path / "data" / "0002")
     assert len(YCBVideoReader(tmp_path, mesh_frame="ycb_video").records()) == 2
+
+
+@pytest.mark.parametrize("typed", [".", "../0048"])
+def test_a_scene_has_its_name_from_within_its_folder(root, typed, monkeypatch):
+    monkeypatch.chdir(root / "data" / "0048")
+    records = YCBVideoReader(typed, NAME).records()
+    assert [(r.name, r.scene_id) for r in records] == [("0048/000001", 48), ("0048/000002", 48)]

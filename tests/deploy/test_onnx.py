@@ -462,6 +462,8 @@ def test_depth_that_is_not_in_meters_is_refused(poses: ModuleType) -> None:
             poses.take_image(settings, rgb, wrong, K)
     with pytest.raises(SystemExit, match="exported for images of 320x240"):
         poses.take_image(settings, rgb[1:], depth[1:], K)
+    with pytest.raises(SystemExit, match="the image has 320x240 pixels, its depth 320x239"):
+        poses.take_image(settings, rgb, depth[1:], K)
 
 
 @pytest.mark.parametrize(

@@ -156,6 +156,9 @@ def test_images_of_one_name_that_show_other_things_are_no_pair() -> None:
     assert match_images([row], [row._replace(visibility=math.nan)])
     assert not match_images([row], [row._replace(visibility=0.8)])
     assert not match_images([row], [row._replace(diameter_mm=210.0)])
+    detected = row._replace(add_mm=math.nan, diameter_mm=math.nan)  # of a method without poses
+    assert match_images([detected], [detected])
+    assert match_images([row], [detected])
 
 
 def test_instances_of_an_image_are_paired_in_their_order() -> None:
@@ -265,6 +268,9 @@ def test_what_cannot_be_compared_is_refused(pair: tuple[Path, Path], tmp_path: P
         read_two_runs(str(pair[0]))
     write_errors(pair[1] / FILE, [make_row(1000, 1.0)])
     with pytest.raises(UserError, match="no common image"):
+        make_comparison_page(a, read_run(pair[1]), "x")
+    write_errors(pair[1] / FILE, [row._replace(add_mm=math.nan) for row in a.errors])
+    with pytest.raises(UserError, match="one of the two only detects, or both"):
         make_comparison_page(a, read_run(pair[1]), "x")
     (pair[1] / FILE).unlink()
     with pytest.raises(UserError, match=r"has no errors\.csv"):

@@ -573,7 +573,7 @@ def test_several_objects_give_a_list_and_the_seed_decides() -> None:
         ({"kld_quantile": 1.0}, "kld_quantile=1.0 must be a number, above 0, at most 0.9"),
         ({"elsewhere_penalty": -1.0}, "elsewhere_penalty=-1.0 must be a number, at least 0"),
         ({"jump_penalty": math.nan}, "jump_penalty=nan must be a number, at least 0, at most"),
-        ({"lost_below": "0.2"}, "lost_below=0.2 must be a number, at least 0, at most 1"),
+        ({"lost_below": "0.2"}, "lost_below='0.2' must be a number, at least 0, at most 1"),
         ({"follow": None}, "follow=None must be of FilterSettings"),
         ({"motion": 5.0}, "motion=5.0 must be of ConstantVelocity"),
     ],

@@ -122,7 +122,8 @@ def calibrate(job: Job) -> None:
     if sum(map(len, absent)) < FEWEST:
         raise UserError(
             f"{data.root}: {sum(map(len, absent))} frames of its validation scenes lack {name}, "
-            f"and {FEWEST} are needed; render some, and name their folder: absent=DIR ("
+            f"and {FEWEST} are needed (those without any annotation are not read); render some, "
+            f"and name their folder: absent=DIR ("
             f"{typed('generate', out='DIR', object=name, absent_fraction=1, frames=60)} meshes=...)"
         )
     calibration = learn(method, [data.val_dataset], absent, data.source, cfg.console)
@@ -179,7 +180,9 @@ def collect_frames(
     """
     values, there, errors, visibility, beliefs, answers = [], [], [], [], [], []
     parts = [(one, True) for one in present] + [(one, False) for one in absent]
-    loaders = [(make_loader(one, _BATCH, 0), is_there) for one, is_there in parts]
+    loaders = [
+        (make_loader(one, one.find_batch_size(_BATCH), 0), is_there) for one, is_there in parts
+    ]
     count = sum(len(loader) for loader, _ in loaders)
     # batch after batch: all of a thousand frames would take gigabytes
     batches = ((batch, is_there) for loader, is_there in loaders for batch in loader)

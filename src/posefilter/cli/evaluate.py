@@ -112,7 +112,7 @@ def _of_checkpoint(job: Job) -> tuple[dict[str, Any], dict[str, Path]]:
     trainer.test(method, datamodule=data, verbose=False)
     method.to(device)  # which Lightning has left
     files = {"beliefs": job.folder / "beliefs.npz", "errors": job.folder / ERRORS}
-    judge_absent(method, data, job.cfg.absent_frames)
+    judge_absent(method, data, job.cfg.absent_frames, job.cfg.console)
     native = data.reader.native_from_mesh
     if "pose" in method.capabilities:
         files["poses"] = job.folder / "poses.csv"
@@ -137,19 +137,28 @@ def warn_of_several(data: PoseDataModule, console: str) -> None:
         warn(console, sentence, several=several, images=len(counts))
 
 
-def judge_absent(method: PoseEstimator, data: PoseDataModule, limit: int) -> None:
+def judge_absent(method: PoseEstimator, data: PoseDataModule, limit: int, console: str) -> None:
     """Add frames of the test's scenes that lack the object to the metrics of a calibrated method.
 
     Args:
         method: It was tested on frames with the object.
         data: The frames' dataset.
         limit: How many frames at most.
+        console: "rich" or "json".
     """
     if method.calibration is None or limit == 0:
         return
     frames = data.absent_dataset("test", limit)
+    if not len(frames):
+        sentence = (
+            f"no frame of the test's scenes annotates other objects and not "
+            f"{method.object_model.name}: false alarms are not counted (frames without any "
+            "annotation are not read)"
+        )
+        warn(console, sentence)
+        return
     with torch.no_grad():
-        for number, batch in enumerate(make_loader(frames, _BATCH, 0)):
+        for number, batch in enumerate(make_loader(frames, frames.find_batch_size(_BATCH), 0)):
             hidden = Batch(*(x.to(method.device) for x in hide_annotation(batch)))
             trace = method.predict_step(hidden, number)
             judge_confidence(method, trace, hidden, present=False)
@@ -216,7 +225,8 @@ def _of_estimates(job: Job) -> tuple[dict[str, Any], dict[str, Path]]:
     found = errors.compute()
     other = 1000 * float(np.median(in_mesh_frame))
     warn_of_frame(found["add"]["median_mm"], other, job.cfg.console)
-    best = (own[0] for own in sort_rows(rows).values())
+    tested = {(r.scene_id, r.im_id, r.obj_id) for r in data.records("test")}
+    best = (own[0] for key, own in sort_rows(rows).items() if key in tested)
     seconds = [row.seconds for row in best if row.seconds >= 0]
     results = found | bop.compute()
     results |= {"iou": float(iou.compute()), "particles_on_object": None}

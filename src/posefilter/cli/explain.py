@@ -39,7 +39,7 @@ _FORMS = {"intrinsics": "fx,fy,cx,cy", "distortion": "k1,k2,p1,p2,k3"}  # of lis
 # what Hydra says of a choice that is made already, and of a setting that there is
 _THERE = re.compile(r"(?:Multiple values for |.* already at ')(\S+?)(?:\. |')")
 # a setting that a class does not take
-_NOT_TAKEN = re.compile(r"(model\.[\w.]+): \w+ takes no such setting$")
+_NOT_TAKEN = re.compile(r"((?:model|loss)\.[\w.]+): \w+ takes no such setting$")
 # choices that packages of others bring
 _EXTRA = ("optuna", "joblib", "submitit_local", "submitit_slurm")
 
@@ -80,10 +80,11 @@ def explain(error: BaseException, name: str, conf: Path, arguments: list[str]) -
             f"{error.override}: cannot be read ({first_line(error)}){_tell_quotes(error.override)}"
         )
     if found := re.match(r"Ambiguous value for argument '(.*)'$", first_line(error)):
-        listed = found[1].replace("=", "=[", 1) + "]"
+        typed = found[1].lstrip("+")  # which `loosen` may have added
+        listed = typed.replace("=", "=[", 1) + "]"
         return (
-            f"{found[1]}: is a list of values, which only a sweep takes (-m); one setting that is "
-            f"a list is typed '{listed}'{_tell_quotes(found[1])}"
+            f"{typed}: is a list of values, which only a sweep takes (-m); one setting that is "
+            f"a list is typed '{listed}'{_tell_quotes(typed)}"
         )
     if isinstance(error, MissingMandatoryValue):
         return f"{error.full_key}: is missing; give {error.full_key}=..."

@@ -1,6 +1,7 @@
 """Folders that commands write to: what is in them is not overwritten, and none is left empty."""
 
 import json
+import shlex
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -55,7 +56,8 @@ class KeepResults(Callback):
             if (folder / "tracks.csv").is_file():
                 refuse(folder, "tracks; choose another folder: out=DIR")
         elif holds_run(folder) and not config.get("resume") and not is_follower():
-            refuse(folder, f"a run already; choose another folder, or resume it: resume={folder}")
+            again = shlex.quote(f"resume={folder}")
+            refuse(folder, f"a run already; choose another folder, or resume it: {again}")
         elif config.hydra.job.name == "train" and not config.get("resume") and not is_follower():
             others = sorted(folder.glob("*/.hydra/config.yaml"))
             if others:

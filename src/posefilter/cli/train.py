@@ -14,10 +14,11 @@ from lightning.fabric.utilities.exceptions import MisconfigurationException
 from lightning.pytorch import callbacks, loops
 from torch.utils.data import default_collate
 
+from posefilter.callbacks.tensorboard import get_boards
 from posefilter.cli.best import check_kept
 from posefilter.cli.build import build_data, build_trainer
 from posefilter.cli.checkpoints import build_method, method_of, read_checkpoint, recipe
-from posefilter.cli.console import is_installed, say, typed
+from posefilter.cli.console import is_installed, say, setting, typed
 from posefilter.cli.folders import move_evaluation, own_metrics
 from posefilter.cli.job import Job
 from posefilter.cli.learned import DATA, list_learned
@@ -157,7 +158,7 @@ def fit(run: Run) -> dict[str, Any]:
     known = own_metrics(run.job.folder).get("training") or {}
     moved = None if is_follower() else move_evaluation(run.job.folder)
     if moved is not None:
-        sentence = f"the evaluation that was here, of an earlier checkpoint, is now in {moved}"
+        sentence = f"the evaluation that was here is now in {moved}"
         say(run.job.cfg.console, "moved", sentence, evaluation=moved)
     began = time.perf_counter(), time.process_time()
     try:
@@ -284,7 +285,8 @@ def finish(
     board = everything if inside else f"tensorboard --logdir {shlex.quote(str(job.folder))}"
     title = f"{job.choices['model']}, loss {job.choices['loss']}"
     files = {"run": job.folder, "checkpoint": tested, "metrics": file}
-    following = [] if job.swept else [report, evaluate, board]
+    boards = [board] if any(get_boards(run.trainer)) else []
+    following = [] if job.swept else [report, evaluate, *boards]
     show(metrics, title, job.cfg.console, "trained", files, following)
     return metrics
 
@@ -332,6 +334,6 @@ def say_stopped(run: Run) -> None:
         words = list_unkept(job.overrides)
         again = " ".join([typed("train", resume=job.folder, **plugins(job)), *words])
         if job.swept:
-            again = f"the same command with out={job.folder.parent}"
+            again = f"the same command with {setting('out', job.folder.parent)}"
         sentence += f"; resume with: {again}"
     say(job.cfg.console, "stopped", sentence, step=step, next=again)

@@ -1,5 +1,6 @@
 """Images of a dataset in which an object is not: where a filter must not find it."""
 
+from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
 
 import torch
@@ -44,6 +45,36 @@ def find_absent(
         if record.name not in showing and record.group not in elsewhere:
             found.setdefault(record.name, record)
     return list(found.values())
+
+
+def deal_images(
+    found: Sequence[FrameRecord], parts: Mapping[str, Sequence[FrameRecord]], split: str
+) -> list[FrameRecord]:
+    """Return those of the images that are of a split, where its scenes were cut by images: of each
+    scene a stretch as long as the split's share, so that no two splits have the same.
+
+    Args:
+        found: One record of each image in which the object is not.
+        parts: The object's records in each split, in the order in which scenes were cut.
+        split: The images' split.
+    """
+    own = {record.name for record in parts[split]}
+    apart = [  # less parts that stand for this one
+        part
+        for part, records in parts.items()
+        if part == split or own.isdisjoint(record.name for record in records)
+    ]
+    counts = {part: Counter(record.group for record in parts[part]) for part in apart}
+    by_scene: dict[str, list[str]] = {}
+    for record in found:
+        by_scene.setdefault(record.group, []).append(record.name)
+    kept = set[str]()
+    for scene, names in by_scene.items():
+        sizes, at = [counts[part][scene] for part in apart], apart.index(split)
+        ends = (sum(sizes[:at]), sum(sizes[: at + 1])) if any(sizes) else (0, 1)  # of no part
+        first, last = (round(len(names) * k / max(sum(sizes), 1)) for k in ends)
+        kept.update(sorted(names)[first:last])
+    return [record for record in found if record.name in kept]
 
 
 def annotates_one_class(records: Sequence[FrameRecord]) -> bool:

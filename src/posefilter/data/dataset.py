@@ -83,6 +83,10 @@ class FrameDataset(Dataset[Batch]):
                 one_of_each = {tuple(self[i].rgb.shape[1:]): i for i in one_of_each.values()}
         return {size: self.records[i].name for size, i in one_of_each.items()}
 
+    def find_batch_size(self, most: int) -> int:
+        """Return how many images a batch may have: so many, or one where they differ in size."""
+        return most if len(self.sizes()) < 2 else 1
+
     def set_epoch(self, epoch: int) -> None:
         """Choose the epoch whose augmentation is drawn."""
         self._epoch.fill_(epoch)

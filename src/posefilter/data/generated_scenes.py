@@ -1,5 +1,6 @@
 """Make sure that the scenes which the project renders itself are there."""
 
+import shlex
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -29,7 +30,7 @@ def ensure_scenes(root: Path, generate: Callable[[Path], Any] | None) -> None:
     state = f"only {there} of {wanted} scenes' frames are here" if there else "no scenes here"
     raise UserError(
         f"{root}: {state} (data.root); is the folder mistyped? Nothing is rendered unless asked: "
-        f"by data.generate.frames=N, or: python generate.py out={root}"
+        f"by data.generate.frames=N, or: python generate.py {shlex.quote(f'out={root}')}"
     )
 
 

@@ -12,7 +12,7 @@ import numpy as np
 from lightning import LightningDataModule
 from torch.utils.data import DataLoader
 
-from posefilter.data.absent import annotates_one_class, find_absent
+from posefilter.data.absent import annotates_one_class, deal_images, find_absent
 from posefilter.data.cache import CACHES, FrameCache, open_cache
 from posefilter.data.dataset import EpochShuffle, FrameDataset
 from posefilter.data.decoding import FrameDecoder
@@ -307,6 +307,9 @@ class PoseDataModule(LightningDataModule):
         scenes = self.split_record() if own else {part: {} for part in NAMES}
         unlisted = getattr(reader, "unlisted", ())  # a plug-in's may have none
         found = find_absent(records, own, scenes, split, name, unlisted)
+        if own:
+            parts = {part: [own[i] for i in self._parts[part]] for part in NAMES}
+            found = deal_images(found, parts, split)
         if found and annotates_one_class(records):
             log.warning(
                 "%s: each image annotates one class; images that do not annotate %s may show it "

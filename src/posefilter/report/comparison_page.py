@@ -108,7 +108,8 @@ def match_images(a: Sequence[ImageError], b: Sequence[ImageError]) -> list[Pair]
 
 def _shows_the_same(a: ImageError, b: ImageError) -> bool:
     """Tell whether two rows of one name may be of one image, as far as both say."""
-    alike = math.isclose(a.diameter_mm, b.diameter_mm, rel_tol=1e-3)
+    unknown = math.isnan(a.diameter_mm) or math.isnan(b.diameter_mm)  # to detectors
+    alike = unknown or math.isclose(a.diameter_mm, b.diameter_mm, rel_tol=1e-3)
     known = not math.isnan(a.visibility) and not math.isnan(b.visibility)
     # of another resolution of the same image it may differ a little
     return alike and not (known and abs(a.visibility - b.visibility) > 0.1)
@@ -144,8 +145,8 @@ def make_comparison_page(a: Run, b: Run, command: str) -> Page:
         raise UserError(f"runs: {a.folder} and {b.folder} were tested on no common image")
     if any(math.isnan(row.add_mm) for pair in pairs for row in pair):
         raise UserError(
-            "runs: one of the two only detects; errors of poses can be compared of "
-            "two that tell poses"
+            "runs: one of the two only detects, or both; errors are compared of two that estimate "
+            "poses"
         )
     names = name_runs(a, b)
     rows = dict(zip(names, ([pair.a for pair in pairs], [pair.b for pair in pairs]), strict=True))

@@ -1,6 +1,7 @@
 """Gather what a run's folder holds; what it lacks is written down rather than fatal."""
 
 import re
+import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -113,7 +114,8 @@ def check_run(folder: Path) -> None:
     if any((folder / mark).is_file() for mark in MARKS) or any(find_event_files(folder)):
         return
     if any((folder / mark).is_file() for mark in SWEEP_MARKS):
-        raise UserError(f"run={folder}: is a sweep's folder; give it as sweep={folder}")
+        given = shlex.quote(f"sweep={folder}")
+        raise UserError(f"run={folder}: is a sweep's folder; give it as {given}")
     raise UserError(
         f"run={folder}: is no run's folder (it has no metrics.json, no "
         f".hydra/config.yaml and no events)"

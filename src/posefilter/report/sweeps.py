@@ -4,6 +4,7 @@ the seed as one.
 
 import csv
 import math
+import shlex
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
@@ -83,7 +84,8 @@ def read_sweep(folder: Path) -> Sweep:
     found = sorted(one for one in known - {folder} if known.isdisjoint(one.parents))
     if not found and not any((folder / mark).is_file() for mark in SWEEP_MARKS):
         own = (folder / ".hydra").is_dir()
-        kind = f"is a run's folder; give it as run={folder}" if own else "is no sweep's folder"
+        given = shlex.quote(f"run={folder}")
+        kind = f"is a run's folder; give it as {given}" if own else "is no sweep's folder"
         raise UserError(
             f"sweep={folder}: {kind} (no run with a metrics.json below it, no "
             f"multirun.yaml, no summary.csv)"

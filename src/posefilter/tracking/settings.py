@@ -23,7 +23,7 @@ def check_settings(settings: Any, place: str) -> None:
         kind = cast(type, one.type)
         if not (isinstance(value, kind) if allowed is None else allowed.holds(value)):
             expected = f"of {kind.__name__}" if allowed is None else allowed
-            raise UserError(f"tracker: {one.name}={value} must be {expected}")
+            raise UserError(f"tracker: {one.name}={value!r} must be {expected}")
 
 
 @dataclass(frozen=True)

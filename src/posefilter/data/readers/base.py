@@ -1,5 +1,6 @@
 """What all readers share: counting what they leave out, and asking meshes about masks."""
 
+import os
 import re
 from collections import Counter
 from collections.abc import Sequence
@@ -31,6 +32,8 @@ class BaseReader:
 
     def __init__(self, root: str | Path, meshes: MeshStore | None, on_error: str) -> None:
         self.root, self.on_error = Path(root), on_error
+        if self.root.name in ("", ".."):  # `.`: a scene has the name of its folder
+            self.root = Path(os.path.abspath(root))  # noqa: PTH100  # links stay as they are
         self.skipped: Counter[str] = Counter()  # what listing left out: reasons and counts
         self.examples: dict[str, str] = {}  # of each reason to skip, the first message
         self.notes: Counter[str] = Counter()  # what else the log should say, with counts
