@@ -100,6 +100,26 @@ def test_a_dataset_may_lack_the_object_altogether(tmp_path: Path) -> None:
     assert len(own.absent_dataset("val")) == 0
 
 
+def test_an_image_that_is_annotated_as_empty_lacks_the_object(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    root, data = write_mesh(tmp_path / "meshes", "obj_000001"), tmp_path / "data"
+    for number in range(4):
+        bop_scene(data / f"{number:06d}", [[(1, pose())], [], [(1, pose())], []])
+    how = {"meshes": root, "mesh_scale": 1.0, "progress": False, "split": {"val": 0.5, "test": 0.5}}
+    module = PoseDataModule("bop", data, "obj_000001", **how)
+    assert len(module.records("val")) == 4, "others are not listed"
+    empty = {part: module.absent_dataset(part) for part in ("val", "test")}
+    names = {part: {record.name for record in found.records} for part, found in empty.items()}
+    assert [len(found) for found in names.values()] == [4, 4]
+    assert not names["val"] & names["test"]
+    assert {name[-1] for found in names.values() for name in found} == {"1", "3"}
+    (batch,) = make_loader(empty["val"], 8, 0)
+    assert not batch.mask.any()
+    assert batch.depth.max() > 0.5
+    assert "annotates one class" not in caplog.text
+
+
 def test_an_image_counts_once_and_only_where_the_object_is_not_listed() -> None:
     def record(name: str, group: str, kind: str, number: int = 0) -> FrameRecord:
         return FrameRecord(name, group, 0, number, 1, kind, number, ())

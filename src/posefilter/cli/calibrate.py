@@ -122,7 +122,7 @@ def calibrate(job: Job) -> None:
     if sum(map(len, absent)) < FEWEST:
         raise UserError(
             f"{data.root}: {sum(map(len, absent))} frames of its validation scenes lack {name}, "
-            f"and {FEWEST} are needed (those without any annotation are not read); render some, "
+            f"and {FEWEST} are needed; render some, "
             f"and name their folder: absent=DIR ("
             f"{typed('generate', out='DIR', object=name, absent_fraction=1, frames=60)} meshes=...)"
         )

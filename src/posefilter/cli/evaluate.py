@@ -151,9 +151,8 @@ def judge_absent(method: PoseEstimator, data: PoseDataModule, limit: int, consol
     frames = data.absent_dataset("test", limit)
     if not len(frames):
         sentence = (
-            f"no frame of the test's scenes annotates other objects and not "
-            f"{method.object_model.name}: false alarms are not counted (frames without any "
-            "annotation are not read)"
+            f"no frame of the test's scenes is known to lack {method.object_model.name}: false "
+            "alarms are not counted"
         )
         warn(console, sentence)
         return

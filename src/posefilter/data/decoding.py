@@ -93,7 +93,7 @@ class FrameDecoder:
                         f"{found}; data.on_error=skip leaves such frames out and counts them"
                     ) from found
                 left_out[found.cause] += 1
-            elif found.pixels == 0:
+            elif found.pixels == 0 and record.object:
                 left_out["the mask vanishes at this image size"] += 1
             elif self._measure_distance(record, found) > FARTHEST:
                 left_out[f"the object is beyond {FARTHEST:.2f} m, where depth is not kept"] += 1

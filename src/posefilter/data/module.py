@@ -297,6 +297,7 @@ class PoseDataModule(LightningDataModule):
         """
         name = self._object if isinstance(self._object, str) else self.objects[0]
         reader = open_whole(self.source, self.root, [name], None, "skip", **self._options)
+        reader.add_empty()
         records = reader.records()
         try:
             own = self._records
@@ -310,7 +311,7 @@ class PoseDataModule(LightningDataModule):
         if own:
             parts = {part: [own[i] for i in self._parts[part]] for part in NAMES}
             found = deal_images(found, parts, split)
-        if found and annotates_one_class(records):
+        if found and annotates_one_class([record for record in records if record.object]):
             log.warning(
                 "%s: each image annotates one class; images that do not annotate %s may show it "
                 "and count as lacking it (absent_frames=0 uses none)",

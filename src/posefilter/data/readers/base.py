@@ -29,6 +29,7 @@ class BaseReader:
 
     objects: tuple[str, ...]  # that it was asked for, or all that it has
     _entries: Sequence[Any]
+    _empty: Sequence[Any] = ()  # likewise, of images that are annotated as showing none
 
     def __init__(self, root: str | Path, meshes: MeshStore | None, on_error: str) -> None:
         self.root, self.on_error = Path(root), on_error
@@ -44,6 +45,11 @@ class BaseReader:
     def records(self) -> Sequence[FrameRecord]:
         """Return every object of every image, in a fixed order."""
         return [entry.record for entry in self._entries]
+
+    def add_empty(self) -> None:
+        """Add a record of each image that is annotated as showing no object; its class is ""."""
+        if self._empty:
+            self._entries = [*self._entries, *self._empty]
 
     def read(self, i: int) -> Sample:
         """Return record i at the dataset's resolution, its visibility still unknown.
@@ -128,7 +134,8 @@ class BaseReader:
         `check_sample` takes them.
         """
         entry, unknown = self._entries[i], float("nan")
-        object_id = self.objects.index(entry.record.object)
+        # one without an object has no index, which nothing reads
+        object_id = self.objects.index(entry.record.object) if entry.record.object else 0
         pose = entry.camera_from_object
         sample = Sample(rgb, depth, mask, narrow(K), narrow(pose), object_id, i, unknown)
         return check_sample(sample, pose @ np.linalg.inv(native_from_mesh), files)

@@ -40,6 +40,8 @@ _DEPTH_ENDINGS = ("png", "tif", "tiff", "PNG", "TIF", "TIFF")  # ITODD's images 
 _INFO = "models_info.json"
 _SAME_DIAMETER = 0.05  # share by which BOP's models of YCB-V may differ from YCB's own
 _IMAGE = _SCENE = re.compile(r"[0-9]{1,9}")
+# the pose of no object: a meter ahead of the camera, since a plausible one is asked for
+_AHEAD = np.array([[1.0, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 1], [0, 0, 0, 1]])
 
 
 @dataclass(frozen=True, eq=False)
@@ -140,6 +142,7 @@ class BopReader(BaseReader):
             self.objects = tuple(name for name in self.objects if name in related)
         self._distrust_builtin()
         self._native = {name: self.native_from_mesh(name) for name in self.objects}
+        self._empty: list[_Entry] = []
         self._entries = [
             entry for folder, scene in scenes for entry in self._list_scene(base, folder, *scene)
         ]
@@ -187,22 +190,30 @@ class BopReader(BaseReader):
         entry = self._entries[i]
         color_path, depth_path, mask_path, gt_path, camera_path = self._files(entry.record)
         check_camera(entry.K, camera_path)
-        if not mask_path.is_file():
-            advice = "bop_toolkit's scripts/calc_gt_masks.py writes the masks"
-            raise BadData(mask_path, "missing file", advice)
-        label = read_label(mask_path)
-        if ((label != 0) & (label != label.max())).any():
-            raise BadData(mask_path, "no mask", "more than two values; is it the depth?")
-        rgb, mask = read_color(color_path), label > 0
+        mask = self._read_mask(mask_path) if entry.record.object else None
+        rgb = read_color(color_path)
         depth = read_depth(depth_path, entry.units, scaled_floats=True)
         height, width = rgb.shape[:2]
         expect_size(depth_path, depth, height, width, color_path.name)
+        files = (camera_path, gt_path, depth_path, mask_path)
+        if mask is None:
+            nothing = np.zeros((height, width), dtype=bool)
+            return self._make_sample(i, rgb, depth, nothing, entry.K, np.eye(4), files)
         expect_size(mask_path, mask, height, width, color_path.name)
         if not mask.any():
             raise NotShown(mask_path, "listed, but not in the label", entry.record.object)
-        files = (camera_path, gt_path, depth_path, mask_path)
         native = self._native[entry.record.object]
         return self._make_sample(i, rgb, depth, mask, entry.K, native, files)
+
+    @staticmethod
+    def _read_mask(path: Path) -> np.ndarray:
+        if not path.is_file():
+            advice = "bop_toolkit's scripts/calc_gt_masks.py writes the masks"
+            raise BadData(path, "missing file", advice)
+        label = read_label(path)
+        if ((label != 0) & (label != label.max())).any():
+            raise BadData(path, "no mask", "more than two values; is it the depth?")
+        return label > 0
 
     def others(self, i: int) -> np.ndarray:
         """Return the pixels of any other labeled object.  -> (H, W) bool."""
@@ -275,6 +286,12 @@ class BopReader(BaseReader):
         subs = ("rgb", "gray")  # where a sensor has no color
         color = _first(folder / sub / f"{stem}.{end}" for sub in subs for end in _ENDINGS)
         depth = _first(folder / "depth" / f"{stem}.{end}" for end in _DEPTH_ENDINGS)
+        if not truth:
+            files = (color, depth, gt_path, gt_path, camera_path)  # there is no mask
+            record = FrameRecord(
+                f"{group}/{stem}", group, int(folder.name), int(image), 0, "", 0, files
+            )
+            self._empty.append(_Entry(record, K, units, _AHEAD, ()))
         entries = []
         for k, one in enumerate(truth):
             where = f"{image}[{k}]."
