@@ -27,8 +27,7 @@ def jobs(words: str) -> list[tuple[str, ...]]:
     pairs = [word.split("=", 1) for word in words.split()]
     return list(
         itertools.product(
-            # a list is one value
-            *([f"{key}={x}" for x in re.split(r",(?![^\[]*\])", values)] for key, values in pairs)
+            *([f"{key}={x}" for x in methods.VALUES.split(values)] for key, values in pairs)
         )
     )
 

@@ -122,8 +122,7 @@ def calibrate(job: Job) -> None:
     if sum(map(len, absent)) < FEWEST:
         raise UserError(
             f"{data.root}: {sum(map(len, absent))} frames of its validation scenes lack {name}, "
-            f"and {FEWEST} are needed; render some, "
-            f"and name their folder: absent=DIR ("
+            f"and {FEWEST} are needed; render some, and name their folder: absent=DIR ("
             f"{typed('generate', out='DIR', object=name, absent_fraction=1, frames=60)} meshes=...)"
         )
     calibration = learn(method, [data.val_dataset], absent, data.source, cfg.console)

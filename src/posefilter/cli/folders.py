@@ -1,7 +1,6 @@
 """Folders that commands write to: what is in them is not overwritten, and none is left empty."""
 
 import json
-import shlex
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -14,6 +13,7 @@ from hydra.experimental.callback import Callback
 from omegaconf import DictConfig
 from omegaconf.errors import OmegaConfBaseException
 
+from posefilter.cli.console import setting
 from posefilter.cli.job import Job, check_out
 from posefilter.cli.plain import key_of
 from posefilter.cli.ranks import is_follower
@@ -56,7 +56,7 @@ class KeepResults(Callback):
             if (folder / "tracks.csv").is_file():
                 refuse(folder, "tracks; choose another folder: out=DIR")
         elif holds_run(folder) and not config.get("resume") and not is_follower():
-            again = shlex.quote(f"resume={folder}")
+            again = setting("resume", folder)
             refuse(folder, f"a run already; choose another folder, or resume it: {again}")
         elif config.hydra.job.name == "train" and not config.get("resume") and not is_follower():
             others = sorted(folder.glob("*/.hydra/config.yaml"))

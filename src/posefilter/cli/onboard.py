@@ -211,7 +211,7 @@ class Onboarding:
         if steps is None:
             steps, seconds = self.plan(speed, self.spent)
             return float(steps * seconds) + self.to_render + self.rest(speed)
-        if any(one.name == "train" and self.is_done(one) for one in STAGES):
+        if "train" not in self.ahead:
             return self.rest(speed)  # it may have ended by its time, before all of its steps
         done = 0
         with suppress(UserError):  # none yet, or a broken one
@@ -242,9 +242,13 @@ class Onboarding:
         searches = 10 * min(_CALIBRATED, self.frames // 10)
         tested = min(int(self.cfg.test_frames), _TEST_FRAMES)  # which are rendered at most
         images = {"train": _VALIDATED, "calibrate": searches, "test": tested}
-        ahead = [one.name for one in STAGES if not self.is_done(one)]
-        seconds = speed.image * sum(images.get(name, 0) for name in ahead)
-        return float(seconds + (_REST if ahead else 0.0))
+        seconds = speed.image * sum(images.get(name, 0) for name in self.ahead)
+        return float(seconds + (_REST if self.ahead else 0.0))
+
+    @property
+    def ahead(self) -> list[str]:
+        """The stages that are not done yet."""
+        return [one.name for one in STAGES if not self.is_done(one)]
 
     @property
     def has_checkpoint(self) -> bool:

@@ -231,11 +231,11 @@ def print_result(result: Result) -> None:
         said = f"probability {within} {_SURFACE.describe()}"
         how = f"pose_tolerance.add_s={_SURFACE.add_s}"
         print(f"{said}: its place is surer than its rotation ({how})")
-    if result.verdict != "absent":
+    absent = result.verdict == "absent"
+    if not absent:
         said = "if it is right" if result.belief_calibrated else "the particles"
         print(f"{said}: {result.belief.uncertainty().describe()}")
     # the pose of an object that is absent says nothing about the camera
-    absent = result.verdict == "absent"
     for warning in result.input_warnings if absent else result.warnings:
         print(f"warning: {warning}")
 

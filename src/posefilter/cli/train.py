@@ -285,8 +285,9 @@ def finish(
     board = everything if inside else f"tensorboard --logdir {shlex.quote(str(job.folder))}"
     title = f"{job.choices['model']}, loss {job.choices['loss']}"
     files = {"run": job.folder, "checkpoint": tested, "metrics": file}
-    boards = [board] if any(get_boards(run.trainer)) else []
-    following = [] if job.swept else [report, evaluate, *boards]
+    following = [] if job.swept else [report, evaluate]
+    if following and get_boards(run.trainer):
+        following.append(board)
     show(metrics, title, job.cfg.console, "trained", files, following)
     return metrics
 

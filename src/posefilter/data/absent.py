@@ -68,11 +68,13 @@ def deal_images(
     by_scene: dict[str, list[str]] = {}
     for record in found:
         by_scene.setdefault(record.group, []).append(record.name)
-    kept = set[str]()
+    kept, at = set[str](), apart.index(split)
     for scene, names in by_scene.items():
-        sizes, at = [counts[part][scene] for part in apart], apart.index(split)
-        ends = (sum(sizes[:at]), sum(sizes[: at + 1])) if any(sizes) else (0, 1)  # of no part
-        first, last = (round(len(names) * k / max(sum(sizes), 1)) for k in ends)
+        sizes = [counts[part][scene] for part in apart]
+        if not any(sizes):  # of no split, and so not cut
+            kept.update(names)
+            continue
+        first, last = (round(len(names) * sum(sizes[:k]) / sum(sizes)) for k in (at, at + 1))
         kept.update(sorted(names)[first:last])
     return [record for record in found if record.name in kept]
 

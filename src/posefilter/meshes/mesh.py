@@ -57,6 +57,11 @@ class Mesh:
         return np.stack([self.vertices.min(0), self.vertices.max(0)])
 
     @cached_property
+    def reach(self) -> float:
+        """How far points are from the bounding box's center at most: half of its diagonal [m]."""
+        return float(np.linalg.norm(np.ptp(self.bounds, axis=0))) / 2
+
+    @cached_property
     def hull_areas(self) -> tuple[float, float]:
         """Area of the convex hull's surface, and a bound of that of its projections [m^2].
 

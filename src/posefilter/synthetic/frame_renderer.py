@@ -240,8 +240,7 @@ class FrameRenderer:
         view = self.job.view()
         for one in layout.placed[: layout.targets]:
             mesh = one.solid.mesh
-            reach = float(np.linalg.norm(np.ptp(mesh.bounds, axis=0))) / 2
-            if view.most_pixels(mesh, one.center[2] - reach) < self.job.least_pixels():
+            if view.most_pixels(mesh, one.center[2] - mesh.reach) < self.job.least_pixels():
                 return False
         return True
 

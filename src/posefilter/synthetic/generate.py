@@ -387,8 +387,8 @@ def _check_apparent_size(job: Job, mesh: Mesh) -> None:
     """Raise UserError where no frame can show enough of an object, before hundreds are tried."""
     if job.scenes.settle:  # what falls may come nearer
         return
-    nearest = job.scenes.distance[0] - float(np.linalg.norm(np.ptp(mesh.bounds, axis=0))) / 2
-    most, least = job.view().most_pixels(mesh, nearest), job.least_pixels()
+    most = job.view().most_pixels(mesh, job.scenes.distance[0] - mesh.reach)
+    least = job.least_pixels()
     if most < least:
         raise UserError(
             f"object={job.object}: is too small for this camera: covers {most:.0f} of "

@@ -72,7 +72,7 @@ class View:
         # by which a length in the frame's corner is longer than in its middle
         stretch = max(float(np.linalg.norm(self.ray(u, v))) for u in (0, 1) for v in (0, 1))
         x, y = float(self.K[0, 0]), float(self.K[1, 1])
-        size = float(np.linalg.norm(np.ptp(mesh.bounds, axis=0)))
+        size = 2 * mesh.reach
         surface, shadow = mesh.hull_areas
         seen = min(surface / 2, shadow + surface / 2 * size / nearest)
         area = seen * x * y * stretch / nearest**2
