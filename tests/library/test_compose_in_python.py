@@ -71,3 +71,9 @@ def test_a_choice_of_null_is_told_what_there_is(typed: str) -> None:
         posefilter.UserError, match=rf"{typed}: takes the name of a choice, .*; there are \w+"
     ):
         posefilter.compose([typed])
+
+
+def test_a_likelihood_without_context_asks_the_network_for_no_features() -> None:
+    method = posefilter.build(posefilter.compose(["model.likelihood.context=null"]))
+    assert method.likelihood.context is None
+    assert method.proposals.parts[-1] == 0

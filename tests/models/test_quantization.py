@@ -66,6 +66,8 @@ def test_points_far_from_the_origin_come_back_as_well_as_those_about_it() -> Non
         assert (found - center - points).abs().max() < 2e-4
     again = unpack_object(pack_object(after._asdict()))
     assert (again.points - center - points).abs().max() < 4e-4
+    del plain["texture"]  # as a file of an earlier version
+    assert (unpack_object(pack_object(plain)).points - center - points).abs().max() < 2e-4
 
 
 def test_surface_points_come_back_to_a_ten_thousandth_and_the_rest_as_it_was() -> None:

@@ -114,6 +114,19 @@ def test_tables_made_before_are_used() -> None:
     assert not torch.allclose(own, other)
 
 
+def test_a_likelihood_without_context_passes_over_an_images_tables() -> None:
+    """They are made where the proposals have features, for whichever likelihood."""
+    g = torch.Generator().manual_seed(0)
+    image, poses, likelihood = make_images(g), make_poses(g), make_likelihood(None)
+    assert image.context is not None
+    tabled = image._replace(tables=fused.make_tables(image.context))
+    rest = (poses, torch.tensor(0.02), CENTER, RADIUS, torch.randn(B, 1, 20, 2, generator=g))
+    with torch.no_grad():
+        assert torch.equal(
+            fused.score(likelihood, tabled, *rest), fused.score(likelihood, image, *rest)
+        )
+
+
 def test_a_likelihood_with_context_refuses_images_without() -> None:
     g = torch.Generator().manual_seed(0)
     image, poses, likelihood = make_images(g, False), make_poses(g), make_likelihood(FEATURES)

@@ -212,8 +212,9 @@ POSE_SPACE_ABLATIONS = (
         ("pose_pf_m7_proposals",
          "Working, without the dense network (so that there is no context).",
          "model/proposals=none", "filter/initialize=from_depth", "model.likelihood.context=null"),
-        ("pose_pf_m8_context", "Working, without the dense network's features at the image points.",
-         "model.likelihood.context=null", "model.proposals.features=0"),
+        ("pose_pf_m8_context",
+         "Working, without the dense network's output at the image points, which the surface term "
+         "reads too.", "model.likelihood.context=null", "model.proposals.features=0"),
         ("pose_pf_m9_surface", "Working, without the term of the pose's own surface.",
          "model/likelihood=contextual"),
         ("pose_pf_m10_turns", "Working, with particles that do not turn about the object's axes.",
@@ -221,7 +222,8 @@ POSE_SPACE_ABLATIONS = (
         ("pose_pf_m11_quasi_monte_carlo", "Working, with independent image points.",
          "model.quasi_monte_carlo=false"),
         ("pose_pf_m12_refine", "Working, without refinement.", "filter/refine=none"),
-        ("pose_pf_m13_icp", "Working, without the alignment with the measured depth.",
+        ("pose_pf_m13_icp",
+         "Working, without the alignment with the measured depth (and the turns by the print).",
          "filter/refine=mean_shift"),
     ),
 )  # fmt: skip

@@ -2,8 +2,8 @@
 
 A likelihood that is trained only near the truth gives high scores to distant wrong poses.
 Candidates therefore also come from measured points anywhere in the image, and from the filter
-itself: persistent particles advance by one step of an annealed filter each time their frame is
-visited (persistent chains, Tieleman 2008).
+itself: persistent particles advance by one step of an annealed filter when the likelihood learns
+from their frame at their noise level (persistent chains, Tieleman 2008).
 """
 
 import math
@@ -83,7 +83,7 @@ def sample_around_truth(
 class PersistentParticles(nn.Module):
     """A few particles for each training frame, kept between visits of the frame.
 
-    The frame's noise level falls geometrically to `sharpest` with each visit; then the frame starts
+    The frame's noise level falls geometrically to `sharpest` with each step; then the frame starts
     anew. Particles are stored relative to the truth (object_from_hypothesis), so that they stay
     valid where augmentation rolls or zooms the camera.
 

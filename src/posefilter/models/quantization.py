@@ -99,7 +99,7 @@ def unpack_object(packed: Mapping[str, Any]) -> ObjectModel:
         fields["texture"] = torch.cat([fields["texture"].float(), normals, colors], 1).half()
     if offset is not None:
         fields["points"] = fields["points"] + offset.to(fields["points"])
-        if fields["texture"] is not None:
+        if fields.get("texture") is not None:  # a file of an earlier version has no such field
             texture = fields["texture"].float()  # in half precision it would be rounded again
             fields["texture"] = torch.cat([texture[:, :3] + offset.to(texture), texture[:, 3:]], 1)
     return ObjectModel(**fields)

@@ -109,7 +109,9 @@ def _find_tables(likelihood: "PoseLikelihood", image: "Pixels") -> Tables | None
     """Return the images' tables, made now where they were not before; None for a likelihood without
     context.
     """
-    if image.tables is not None or likelihood.context is None:
+    if likelihood.context is None:
+        return None
+    if image.tables is not None:
         return image.tables
     if image.context is None:
         raise missing_context()

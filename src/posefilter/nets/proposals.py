@@ -19,7 +19,7 @@ class ObjectCoordinateNet(UNet):
     Args:
         widths: Channels at strides 4, 8, 16 and 32.
         fragments: Number of surface fragments, K.
-        features: Further features of each cell, for the likelihood.
+        features: Further features of each cell, for the likelihood; None for none.
     """
 
     provides: ClassVar[Capabilities] = ("object_coordinates", "propose_poses", "objectness")
@@ -31,9 +31,10 @@ class ObjectCoordinateNet(UNet):
         self,
         widths: tuple[int, int, int, int] = (32, 80, 128, 160),
         fragments: int = 64,
-        features: int = 0,
+        features: int | None = 0,
     ) -> None:
         super().__init__()
+        features = features or 0
         self.fragments = fragments
         self.register_buffer("centers", torch.zeros(fragments, 3))
         self.register_buffer("reach", torch.ones(()))
