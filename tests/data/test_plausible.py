@@ -16,6 +16,7 @@ from posefilter.data.module import PoseDataModule
 from posefilter.data.readers.bop import BopReader
 from posefilter.data.readers.decode import holds_meters, read_depth
 from posefilter.data.readers.fat import FatReader
+from posefilter.data.readers.plausible import find_center_flaw
 from posefilter.data.readers.ycb_video import YCBVideoReader
 from posefilter.errors import BadData, UserError
 from posefilter.limits import read_json
@@ -470,3 +471,19 @@ def test_instances_of_one_image_are_counted_as_such(tmp_path, caplog):
     data.setup("test")
     own = data.describe()["splits"]["test"]
     assert (own["frames"], own["images"]) == (2, 1)
+
+
+@pytest.mark.parametrize(
+    ("cx", "size", "fits"),
+    [
+        (312.0, (640, 480), True),
+        (-102.0, (125, 225), True),  # the part of an image that shows an object at its right
+        (-376.0, (640, 480), True),  # a region of a sensor, beside the axis
+        (1066.0, (640, 480), True),  # likewise, on the other side
+        (2000.0, (640, 480), False),
+        (-1600.0, (125, 225), False),  # 57 degrees beside the axis
+    ],
+)
+def test_a_part_of_an_image_may_lie_beside_the_axis(cx, size, fits):
+    K = np.array([[1066.0, 0, cx], [0, 1066.0, 240.0], [0, 0, 1]])
+    assert (find_center_flaw(K, *size) == "") == fits

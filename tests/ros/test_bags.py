@@ -525,6 +525,53 @@ def test_color_and_depth_are_nearest_to_one_another(
     assert [*zip([int(one.rgb[0, 0, 0]) for one in frames], depths, strict=True)] == wanted
 
 
+def write_marked(path: Path, order: list[tuple[str, int, int]]) -> Path:
+    """Write a bag of small images: color (`c`) or depth (`d`), the header's time and that of the
+    recording [ms]; depth is the header's time [mm], and color its number.
+    """
+    K = np.array([[100.0, 0, 2], [0, 100, 2], [0, 0, 1]])
+    messages = [("/info", CAMERA_INFO, 0, make_info(K))]
+    for kind, time, recorded in order:
+        image = make_image(np.full((4, 4), 1000 + time, np.uint16), "16UC1", time)
+        if kind == "c":
+            image = make_image(np.full((4, 4, 3), time // 33, np.uint8), "rgb8", time)
+        messages.append(("/rgb" if kind == "c" else "/depth", IMAGE, recorded, image))
+    return write_bag(path, sorted(messages, key=lambda one: one[2]))
+
+
+def test_depth_may_be_recorded_seconds_after_its_color(tmp_path: Path) -> None:
+    """As by a node that aligns it and lags; what comes later than that is counted, and told."""
+    times = [33 * number for number in range(1, 101)]
+    order = [(kind, t, t + 2000 * (kind == "d")) for t in times for kind in "cd"]
+    with BagReader(write_marked(tmp_path / "in", order), TOPICS, 0.01) as reader:
+        frames = [*reader.frames()]
+        assert reader.unpaired == 0
+    assert [int(one.rgb[0, 0, 0]) for one in frames] == [*range(1, 101)]
+    late = [(kind, t, t + 9000 * (kind == "d")) for t in times for kind in "cd"]
+    with BagReader(write_marked(tmp_path / "late", late), TOPICS, 0.01) as reader:
+        assert not [*reader.frames()]
+        assert reader.unpaired == 100
+        assert "depth within max_time_difference=0.01 s that was recorded within 5 s of it" in (
+            reader.explain_none()
+        )
+
+
+def test_what_waits_is_bounded_in_memory(tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.setattr("posefilter.ros.bags._MEMORY", 40 * 48)  # 40 small color images
+    times = [33 * number for number in range(1, 101)]
+    order = [(kind, t, t + 2000 * (kind == "d")) for t in times for kind in "cd"]
+    with BagReader(write_marked(tmp_path / "in", order), TOPICS, 0.01) as reader:
+        frames = [*reader.frames()]
+        assert reader.unpaired == 100 - len(frames)
+        assert 30 < len(frames) < 100
+
+
+def test_images_that_were_recorded_in_another_order_come_in_that_of_time(tmp_path: Path) -> None:
+    order = [("c", 33, 1), ("c", 0, 2), ("d", 0, 3), ("d", 33, 4), ("c", 66, 66), ("d", 66, 67)]
+    with BagReader(write_marked(tmp_path / "in", order), TOPICS, 0.01) as reader:
+        assert [int(one.rgb[0, 0, 0]) for one in reader.frames()] == [0, 1, 2]
+
+
 @pytest.mark.slow
 def test_mistakes_are_one_line(tmp_path: Path, capfd) -> None:
     bag = write_scene(tmp_path / "in", (50,))

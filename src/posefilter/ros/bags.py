@@ -27,7 +27,9 @@ from posefilter.ros.messages import (
 
 _NAME = re.compile(r"(/[A-Za-z_][A-Za-z0-9_]*)+")  # of a topic, with its namespace
 _MCAP, _ROS1 = b"\x89MCAP0\r\n", b"#ROSBAG V"  # that files begin with; the former ends with it, too
-_WAITING = 30  # messages of a topic that wait for one of another
+# how long a message waits for one of another topic [ns], by the recording; the oldest go before,
+# where more than some messages and some memory [bytes] wait
+_WAITING, _FEW, _MEMORY = 5_000_000_000, 30, 2**28
 
 
 class Topics(NamedTuple):
@@ -49,7 +51,7 @@ class BagFrame(NamedTuple):
 
 
 class BagReader:
-    """The frames of a bag, in the order of time.
+    """The frames of a bag, in the order of time as far as it was recorded so.
 
     Args:
         path: A bag's folder, or its .mcap or .db3 file.
@@ -143,8 +145,7 @@ class BagReader:
         Raises:
             UserError: A message is damaged, or color, depth and camera are not of one size.
         """
-        colors: deque[tuple[int, int, Any]] = deque(maxlen=_WAITING)
-        depths: deque[tuple[int, int, Any]] = deque(maxlen=_WAITING)
+        colors, depths = deque[tuple[int, int, Any]](), deque[tuple[int, int, Any]]()
         camera: Any = None
         last: dict[str, int] = {}  # a first time of 0 may be a simulation's; a second one is none
         for connection, time, raw in self.messages():
@@ -160,7 +161,8 @@ class BagReader:
                 self.distorted |= is_distorted(message) and not self.rectify
                 continue
             own = colors if connection.topic == self.topics.color else depths
-            self.unpaired += own is colors and len(own) == _WAITING
+            _drop_late(depths, time)
+            self.unpaired += _drop_late(colors, time)
             stamp = time if self._by_recording else stamp_of(message)
             own.append((stamp, time, message))
             if not self._by_recording and stamp == last.get(connection.topic) == 0:
@@ -182,7 +184,7 @@ class BagReader:
         That is known once both topics have told of a moment as late, or the bag has ended; what is
         yielded waits no longer.
         """
-        for color in [*colors]:
+        for color in sorted(colors, key=lambda one: one[0]):
             near = min(depths, key=lambda one: abs(one[0] - color[0]), default=None)
             if near is None:
                 continue
@@ -229,12 +231,11 @@ class BagReader:
         limit = f"max_time_difference={self.tolerance / 1e9:g} s"
         if self.early:
             return f"camera_info={self.topics.camera_info}: its first message is after all images"
+        near = f"no color image has depth within {limit} that was recorded within "
+        near += f"{_WAITING / 1e9:g} s of it"
         if self._nearest is not None:
-            return (
-                f"no color image has depth within {limit}; the nearest is "
-                f"{self._nearest / 1e9:.4g} s away"
-            )
-        return f"no color image has depth within {limit}, after a first camera_info"
+            return f"{near}; the nearest is {self._nearest / 1e9:.4g} s away"
+        return f"{near}, after a first camera_info"
 
     def _warn(self, sentence: str) -> None:
         if sentence not in self.warnings:
@@ -302,6 +303,17 @@ class BagReader:
                 advice = "is it aligned to the color?" if key == "depth" else "is it the color's?"
                 topic = getattr(self.topics, key)
                 self._warn(f"{key}={topic} is of the frame {other}, the color of {own}: {advice}")
+
+
+def _drop_late(waiting: deque[Any], now: int) -> int:
+    """Drop the messages that have waited in vain until a time of recording [ns], and return how
+    many these are.
+    """
+    count = len(waiting)
+    size = sum(one[2].data.nbytes for one in waiting)
+    while waiting and (now - waiting[0][1] > _WAITING or (len(waiting) > _FEW and size > _MEMORY)):
+        size -= waiting.popleft()[2].data.nbytes
+    return count - len(waiting)
 
 
 def _find_remedy(path: Path) -> str:

@@ -257,7 +257,7 @@ class Track:
         belief = sight.belief if trusted or predicted is None else None
         self.state = self._correct(predicted, belief, status)
         self.frames += 1
-        run = self._describe(sight, frame.blank, measured=belief is not None)
+        run = self._describe(sight, frame.blank, measured=belief is not None and status != LOST)
         run = run._replace(photograph=frame.shrink(self.size))
         result = make_result(run, 0, self.costs, self.pose_tolerance)
         # the guarantee of conformal sets is of the filter that was calibrated, no track's

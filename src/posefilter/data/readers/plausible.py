@@ -12,6 +12,7 @@ from posefilter.geometry.camera import find_matrix_flaw
 FARTHEST = 100.0  # [m] of an object, and of the median of what a depth image holds
 _NEAREST = 0.01  # [m] of that median
 _FOCAL = (0.1, 100.0)  # focal lengths, in widths of the image: 157 to 0.6 degrees of view
+_ASKEW = 1.5  # focal lengths between the axis and an image's middle: 56 degrees
 _SQUARE = 2.0  # the focal lengths of one camera differ by this factor at most
 _UNITS = (1e-2, 1e7)  # depth image units a meter
 
@@ -36,11 +37,12 @@ def find_focal_flaw(K: np.ndarray, width: int) -> str:
 def find_center_flaw(K: np.ndarray, width: int, height: int) -> str:
     """Return why a principal point cannot be right for images of a size [px], "" where it may be.
 
-    That of a part of an image may lie outside of it.
+    That of a part of an image may lie outside of it, as far as a camera sees.
     """
     cx, cy = float(K[0, 2]), float(K[1, 2])
     at = f"({cx:g}, {cy:g}) of {width}x{height}"
-    if not (-width / 2 <= cx <= 1.5 * width and -height / 2 <= cy <= 1.5 * height):
+    off_x, off_y = abs(cx - width / 2), abs(cy - height / 2)
+    if off_x > max(width, _ASKEW * K[0, 0]) or off_y > max(height, _ASKEW * K[1, 1]):
         return f"{at}; another resolution's, or swapped with fx?"
     if 0 <= cx <= 1 and 0 <= cy <= 1:
         return f"{at}; left out, or in units of the image's size?"
