@@ -11,6 +11,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from posefilter.errors import UserError
+from posefilter.geometry.rotation import fibonacci_sphere
 from posefilter.meshes.mesh import Mesh
 from posefilter.meshes.store import MeshStore
 from posefilter.rendering.embree import EmbreeRenderer
@@ -66,6 +67,19 @@ def test_a_box_rests_on_its_six_faces_and_nowhere_else() -> None:
     flat = weights[np.abs(down[:, 0]) > 0.9].sum()
     upright = weights[np.abs(down[:, 2]) > 0.9].sum()
     assert flat > 3 * upright  # a tossed box ends on its widest faces
+
+
+def test_a_tall_box_can_stand_although_a_tossed_one_seldom_does() -> None:
+    """As a box of sugar, whose foot is narrow and whose sides are a little rounded."""
+    hull = fibonacci_sphere(3000)
+    hull = np.sign(hull) * np.abs(hull) ** 0.15 * (0.0245, 0.047, 0.088)
+    rests, weights = find_stable_rotations(hull)
+    down = -rests[:, 2, :]
+    (standing,) = np.flatnonzero(down[:, 2] < -0.99)
+    assert 0 < weights[standing] < 0.03
+    tilted = -rotation_down(np.array([0.0, -0.8, -0.6]))[2]  # a frame in which it does not stand
+    rests, _ = find_stable_rotations(hull @ rotation_down(tilted).T)
+    assert (rests[:, 2, 2] < 0.99).all()
 
 
 def test_turn_down_turns_down() -> None:

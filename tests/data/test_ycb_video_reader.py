@@ -10,6 +10,7 @@ import scipy.io
 from dataset_trees import HEIGHT, WIDTH, K, pose, truth, write_png, ycb_frame
 
 from posefilter.data.frames import NotShown
+from posefilter.data.module import PoseDataModule
 from posefilter.data.readers.ycb_video import YCBVideoReader
 from posefilter.data.splits import split_records
 from posefilter.errors import BadData, UserError
@@ -205,3 +206,11 @@ def test_a_scene_has_its_name_from_within_its_folder(root, typed, monkeypatch):
     monkeypatch.chdir(root / "data" / "0048")
     records = YCBVideoReader(typed, NAME).records()
     assert [(r.name, r.scene_id) for r in records] == [("0048/000001", 48), ("0048/000002", 48)]
+
+
+def test_an_object_that_no_image_shows_is_told_as_such(root):
+    """The folder is right, and has frames of others."""
+    data = PoseDataModule("ycb_video", root, "037_scissors", progress=False)
+    with pytest.raises(UserError) as told:
+        data.setup("test")
+    assert str(told.value) == f"data.object=037_scissors: no frame in {root} (data.root) shows it"

@@ -89,7 +89,7 @@ def typed(command: str, **settings: Any) -> str:
 
 def typed_prediction(checkpoint: Path) -> str:
     """Return a command line that estimates with a checkpoint, with an image of no dataset."""
-    image = "rgb=a.png depth=a_depth.png intrinsics=fx,fy,cx,cy depth_scale=10000"
+    image = "rgb=a.png depth=a_depth.png intrinsics=fx,fy,cx,cy depth_scale=UNITS_PER_METER"
     return f"{typed('predict', checkpoint=checkpoint)} {image}"
 
 

@@ -162,6 +162,10 @@ class PoseDataModule(LightningDataModule):
     @cached_property
     def _parts(self) -> dict[str, list[int]]:
         """The indices of each split's records, before any frame is decoded."""
+        if not self._records and self._object is not None:
+            raise UserError(
+                f"data.object={self._object}: no frame in {self.root} (data.root) shows it"
+            )
         return split_records(self._records, self._split, self._split_seed, self.root)
 
     @cached_property

@@ -446,7 +446,8 @@ def _open_dataset(out: Path, job: Job, frames: int, mesh: Mesh | None) -> None:
     elif out.is_dir() and any(path.name != LOCK for path in out.iterdir()):
         raise UserError(
             f"{out}: not empty, and not begun by this generator (no {GENERATOR}); render into "
-            "another folder"
+            "another folder, or, for images of your own, name their format (data=fat, ycb_video or "
+            "bop)"
         )
     out.mkdir(parents=True, exist_ok=True)
     packages = ("posefilter", "numpy", "embreex", "opencv-python-headless")
