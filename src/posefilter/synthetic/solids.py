@@ -9,7 +9,6 @@ from posefilter.geometry.rotation import fibonacci_sphere
 from posefilter.meshes.mesh import Mesh
 from posefilter.rendering.surfaces import project
 
-
 _OWN = 0.26  # [rad] a rest that is no farther from the mesh's own is the own
 
 
