@@ -122,19 +122,36 @@ def test_a_dent_spoils_a_symmetry() -> None:
     assert find_symmetries(replace(box, vertices=vertices)) == []
 
 
+def about(axes: list[list[float]], folds: tuple[int, ...]) -> list[RotationalSymmetry]:
+    """Return turns about axes through the origin, the best first."""
+    return [
+        RotationalSymmetry(
+            np.array(axis) / np.linalg.norm(axis), np.zeros(3), fold, 0.0, 0.0, 0.0, True, True
+        )
+        for axis, fold in zip(axes, folds, strict=True)
+    ]
+
+
 def test_a_badly_measured_axis_costs_none_of_the_others() -> None:
     """A box of square section has eight symmetries, also where a diagonal axis is 3 degrees off."""
-    axes = np.array([[1, 0, 0], [0, 0, 1], [0, 1, 0], [0.748, -0.664, 0], [-0.664, -0.748, 0]])
-    turns = [
-        RotationalSymmetry(
-            axis / np.linalg.norm(axis), np.zeros(3), fold, 0.0, 0.0, 0.0, True, True
-        )
-        for axis, fold in zip(axes, (2, 4, 2, 2, 2), strict=True)
-    ]
-    group = make_group(turns, 0.2)
+    axes = [[1, 0, 0], [0, 0, 1], [0, 1, 0], [0.748, -0.664, 0], [-0.664, -0.748, 0]]
+    group = make_group(about(axes, (2, 4, 2, 2, 2)), 0.2)
     assert len(group) == 8
     for product in (a @ b for a in group for b in group):
         assert distance_to(group, product) < 1e-9
+
+
+@pytest.mark.parametrize("frame", [0.0, 0.7, 1.1])
+def test_a_badly_measured_axis_that_others_imply_changes_no_turn(frame: float) -> None:
+    """Two axes of a box of square section make its eight symmetries, whatever frame it is in."""
+    axes = np.array([[0, 0, 1], [1, 0, 0], [0, 1, 0], [-0.748, 0.664, 0], [0.664, 0.748, 0.004]])
+    turned = axes @ rotation_about(np.array([0.6, 0.0, 0.8]), frame, np.zeros(3))[:3, :3].T
+    turns = about(turned.tolist(), (4, 2, 2, 2, 2))
+    group = make_group(turns, 0.2)
+    assert len(group) == 8
+    for exact in make_group(turns[:2], 0.2):
+        assert distance_to(group, exact) < 1e-9
+    assert all(is_in_use(turn, group) for turn in turns)
 
 
 def test_every_fold_that_is_tried_has_a_description() -> None:
