@@ -17,7 +17,9 @@ from posefilter.cli.evaluate import data_settings
 from posefilter.cli.generate import generate
 from posefilter.cli.plain import to_plain
 from posefilter.cli.train import places
+from posefilter.data.frames import Sample
 from posefilter.errors import ProblemsFound, Stopped, UserError
+from posefilter.figures.preview import draw_frame
 
 HOME = Path(__file__).parents[2]
 CONF = HOME / "conf"
@@ -182,6 +184,26 @@ def test_one_frame_can_be_generated(tmp_path: Path, capsys: pytest.CaptureFixtur
     generate(compose_job("generate", CONF, [f"out={tmp_path}/one", "frames=1", *size], tmp_path))
     assert (tmp_path / "one" / "preview.png").is_file()
     assert json.loads(capsys.readouterr().out)["frames"] == 1
+
+
+@pytest.mark.parametrize(
+    ("more", "shown"),
+    [(["instances=3", "absent_fraction=0.5", "frames=4"], 2), (["stereo=true", "frames=2"], 2)],
+)
+def test_a_preview_shows_each_frame_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, more: list[str], shown: int
+) -> None:
+    """Whatever the number of instances and cameras."""
+    titles: list[str] = []
+
+    def draw(instances: list[Sample], name: str, near: float, far: float) -> np.ndarray:
+        titles.append(name)
+        return draw_frame(instances, name, near, far)
+
+    monkeypatch.setattr("posefilter.figures.preview.draw_frame", draw)
+    typed = [f"out={tmp_path}", "size=[96,72]", "workers=1", "console=json", *more]
+    generate(compose_job("generate", CONF, typed, tmp_path))
+    assert len(titles) == len({title.rpartition(".")[0] for title in titles}) == shown
 
 
 def test_frames_without_the_object_can_be_generated(

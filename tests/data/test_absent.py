@@ -133,38 +133,93 @@ def test_an_image_counts_once_and_only_where_the_object_is_not_listed() -> None:
         record("c/0", "c", "can"),  # of no split
         record("c/1", "c", "box"),
     ]
-    splits = {"train": {"b": 3}, "val": {"a": 1}, "test": {}}
-    found = find_absent(everything, own, splits, "val", "box")
-    assert [one.name for one in found] == ["a/1", "c/0"]
-    both = {**splits, "test": {"e": 1}}
-    everything += [record(f"{group}/0", group, "can") for group in "de"]
-    names = {part: find_absent(everything, own, both, part, "box") for part in ("val", "test")}
-    assert [one.name for one in names["val"]] == ["a/1", "c/0"]
-    assert [one.name for one in names["test"]] == ["d/0", "e/0"]
+    unlisted = {("c/2", "box")}
+    everything.append(record("c/2", "c", "can"))
+    found = find_absent(everything, own, "box", unlisted)
+    assert [one.name for one in found] == ["a/1", "b/0", "c/0"]
+    splits = {"train": [record("b/9", "b", "box", 9)], "val": own, "test": []}
+    assert [one.name for one in deal_images(found, splits, "val")] == ["a/1", "c/0"]
+    splits["test"] = [record("f/0", "f", "box")]
+    found += [record(f"{group}/0", group, "can") for group in "de"]
+    names = {part: [one.name for one in deal_images(found, splits, part)] for part in splits}
+    assert names["val"] == ["a/1", "c/0", "e/0"]
+    assert names["test"] == ["d/0"]
+
+
+def frames(group: str, numbers: range, cameras: str = "") -> list[FrameRecord]:
+    """Return a record of each image of a scene; of a pair `cameras` has a letter of each."""
+    return [
+        FrameRecord(f"{group}/{n:02d}{camera}", group, 0, n, 1, "can", n, ())
+        for camera in cameras or [""]
+        for n in numbers
+    ]
+
+
+def deal(
+    found: list[FrameRecord], parts: dict[str, list[FrameRecord]], splits: tuple[str, ...]
+) -> list[set[str]]:
+    """Return the names of the images that each of the splits gets."""
+    return [{one.name for one in deal_images(found, parts, split)} for split in splits]
 
 
 @pytest.mark.parametrize("parts", [("train", "val", "test"), ("val", "test")])
 def test_splits_of_one_scene_share_no_image_without_the_object(parts: tuple[str, ...]) -> None:
-    def records(group: str, numbers: range) -> list[FrameRecord]:
-        return [FrameRecord(f"{group}/{n:02d}", group, 0, n, 1, "can", n, ()) for n in numbers]
-
-    found = [*records("b", range(3)), *records("a", range(20, 40))]
+    found = frames("a", range(20, 40))
     sizes = {"train": 5, "val": 3, "test": 2}
     cut, first = {part: list[FrameRecord]() for part in sizes}, 0
     for part in parts:
-        cut[part] = records("a", range(first, first + sizes[part]))
+        cut[part] = frames("a", range(first, first + sizes[part]))
         first += sizes[part]
-    dealt = {part: [one.name for one in deal_images(found, cut, part)] for part in parts}
-    here = {part: {name for name in names if name[0] == "a"} for part, names in dealt.items()}
-    assert set().union(*here.values()) == {one.name for one in found[3:]}
-    assert sum(map(len, here.values())) == 20
+    dealt = deal(found, cut, parts)
+    assert set().union(*dealt) == {one.name for one in found}
     whole = sum(sizes[part] for part in parts)
-    assert {part: len(names) for part, names in here.items()} == {
-        part: 20 * sizes[part] // whole for part in parts
-    }
-    assert all(names[:3] == ["b/00", "b/01", "b/02"] for names in dealt.values()), "of no split"
-    again = cut | {"train": cut["test"]}  # data.split={train: test}
-    assert len(deal_images(found, again, "test")) == 3 + 20 * 2 // 5
+    assert [len(names) for names in dealt] == [20 * sizes[part] // whole for part in parts]
+
+
+def test_a_part_that_stands_for_another_has_its_images() -> None:
+    found = frames("a", range(20, 40)) + frames("b", range(3)) + frames("c", range(3))
+    first, second = frames("a", range(3)), frames("a", range(3, 5))
+    everything = {one.name for one in found}
+    val, test = deal(found, {"train": second, "val": first, "test": second}, ("val", "test"))
+    assert (len(val), len(test)) == (12 + 3, 8 + 3)
+    assert val | test == everything, "data.split={train: test}"
+    val, test = deal(found, {"train": first, "val": second, "test": second}, ("val", "test"))
+    assert val == test, "data.split={val: test}"
+    assert len(val) == 8 + 6
+
+
+def test_scenes_of_no_split_are_dealt_also_where_scenes_were_cut_by_images() -> None:
+    cut = {"train": [], "val": frames("a", range(3)), "test": frames("a", range(3, 6))}
+    found = [one for group in "bcd" for one in frames(group, range(4))]
+    val, test = deal(found, cut, ("val", "test"))
+    assert {name[0] for name in val} == {"b", "d"}
+    assert {name[0] for name in test} == {"c"}
+    whole = {**cut, "test": frames("e", range(3))}
+    assert [len(names) for names in deal(found[:4], whole, ("val", "test"))] == [4, 0]
+
+
+def test_one_scene_with_the_object_and_one_without_are_both_cut(tmp_path: Path) -> None:
+    root, data = write_mesh(tmp_path / "meshes", "obj_000001"), tmp_path / "data"
+    for number, kind in enumerate((1, 2)):
+        bop_scene(data / f"{number:06d}", [[(kind, pose())] for _ in range(6)])
+    how = {"meshes": root, "mesh_scale": 1.0, "progress": False, "split": {"val": 0.5, "test": 0.5}}
+    module = PoseDataModule("bop", data, "obj_000001", **how)
+    names = [{one.name[-1] for one in module.absent_dataset(part).records} for part in how["split"]]
+    assert names == [{*"012"}, {*"345"}]
+
+
+def test_no_stereo_pair_is_cut() -> None:
+    cut = {"train": [], "val": frames("a", range(3)), "test": frames("a", range(3, 6))}
+    for group in "ab":  # a scene that was cut, and one of no split
+        found = frames(group, range(10, 15), cameras="lr")
+        val, test = ({name[:4] for name in names} for names in deal(found, cut, ("val", "test")))
+        assert val | test == {f"{group}/{n}" for n in range(10, 15)}
+        assert not val & test
+    right = frames("a", range(6), cameras="r")  # its twin shows the object
+    val, test = deal(right, cut, ("val", "test"))
+    assert val == {"a/00r", "a/01r", "a/02r"}
+    twin = frames("a", range(2, 3), cameras="r")
+    assert deal(twin, cut, ("val", "test")) == [{"a/02r"}, set()]
 
 
 def test_images_that_annotate_one_class_each_may_show_others(

@@ -37,9 +37,8 @@ def test_an_image_of_two_that_cannot_be_told_apart_does_not_lack_the_object(tmp_
     assert not images & {one.name for one in reader.records() if one.object == "carton"}
     others = [one for one in reader.records() if one.name in images]
     assert others
-    parts: dict[str, dict[str, int]] = {"train": {}, "val": {}, "test": {}}
-    assert find_absent(others, [], parts, "val", "carton")
-    assert not find_absent(others, [], parts, "val", "carton", reader.unlisted)
+    assert find_absent(others, [], "carton")
+    assert not find_absent(others, [], "carton", reader.unlisted)
 
 
 def test_a_broken_record_does_not_make_all_images_lack_the_object(tmp_path: Path) -> None:

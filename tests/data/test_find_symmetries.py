@@ -32,6 +32,13 @@ def distance_to(group: np.ndarray, transform: np.ndarray) -> float:
     return float(np.abs(group - transform).max((1, 2)).min())
 
 
+def paint_gray(solid: trimesh.Trimesh) -> Mesh:
+    gray = np.full((2, 2, 3), 128, np.uint8)
+    normals = np.repeat(np.array(solid.face_normals)[:, None], 3, axis=1)
+    vertices, faces = np.array(solid.vertices), np.array(solid.faces)
+    return Mesh("solid", vertices, faces, None, gray, None, normals)
+
+
 def test_a_printed_box_is_symmetric_by_shape_alone() -> None:
     mesh = catalog.build("gelatin_carton")
     turns = find_symmetries(mesh)
@@ -78,20 +85,35 @@ def test_the_axis_of_a_cone_as_wide_as_high_is_found(
     """All its moments of inertia are alike."""
     solid = trimesh.creation.cone(radius=0.05, height=0.1 * ratio, sections=sides)
     turned = solid.apply_transform(rotation_about(np.array([0.6, 0.0, 0.8]), 1.1, np.zeros(3)))
-    gray = np.full((2, 2, 3), 128, np.uint8)
-    normals = np.repeat(turned.face_normals[:, None], 3, axis=1)
-    vertices, faces = np.array(turned.vertices), np.array(turned.faces)
-    mesh = Mesh("cone", vertices, faces, None, gray, None, normals)
-    assert folds(find_symmetries(mesh), texture=False) == expected
+    assert folds(find_symmetries(paint_gray(turned)), texture=False) == expected
 
 
 @pytest.mark.parametrize(("sides", "members"), [(5, 10), (6, 12)])
 def test_a_prism_has_its_turns_and_half_turns(sides: int, members: int) -> None:
     solid = trimesh.creation.cylinder(radius=0.05, height=0.04, sections=sides)
-    gray = np.full((2, 2, 3), 128, np.uint8)
-    normals = np.repeat(np.array(solid.face_normals)[:, None], 3, axis=1)
-    mesh = Mesh("prism", np.array(solid.vertices), np.array(solid.faces), None, gray, None, normals)
-    assert len(make_group(select(find_symmetries(mesh), texture=False), 0.1)) == members
+    turns = select(find_symmetries(paint_gray(solid)), texture=False)
+    assert len(make_group(turns, 0.1)) == members
+
+
+CORNERS = {
+    "octahedron": [*np.eye(3), *-np.eye(3)],
+    "tetrahedron": [[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]],
+}
+
+
+@pytest.mark.parametrize(("name", "members"), [("octahedron", 24), ("tetrahedron", 12)])
+def test_a_solid_with_several_axes_of_third_turns_has_all_its_turns(
+    name: str, members: int
+) -> None:
+    """All axes through its middle are principal."""
+    solid = trimesh.convex.convex_hull(0.05 * np.array(CORNERS[name]))
+    turned = solid.apply_transform(rotation_about(np.array([0.6, 0.0, 0.8]), 1.1, np.zeros(3)))
+    turns = select(find_symmetries(paint_gray(turned)), texture=False)
+    group = make_group(turns, 0.1)
+    assert len(group) == members
+    for transform in group:
+        moved = turned.vertices @ transform[:3, :3].T + transform[:3, 3]
+        assert np.abs(moved[:, None] - turned.vertices).max(-1).min(1).max() < 5e-4
 
 
 def test_symmetries_move_with_the_object_and_survive_the_file(tmp_path: Path) -> None:
@@ -122,19 +144,36 @@ def test_a_dent_spoils_a_symmetry() -> None:
     assert find_symmetries(replace(box, vertices=vertices)) == []
 
 
+def about(axes: list[list[float]], folds: tuple[int, ...]) -> list[RotationalSymmetry]:
+    """Return turns about axes through the origin, the best first."""
+    return [
+        RotationalSymmetry(
+            np.array(axis) / np.linalg.norm(axis), np.zeros(3), fold, 0.0, 0.0, 0.0, True, True
+        )
+        for axis, fold in zip(axes, folds, strict=True)
+    ]
+
+
 def test_a_badly_measured_axis_costs_none_of_the_others() -> None:
     """A box of square section has eight symmetries, also where a diagonal axis is 3 degrees off."""
-    axes = np.array([[1, 0, 0], [0, 0, 1], [0, 1, 0], [0.748, -0.664, 0], [-0.664, -0.748, 0]])
-    turns = [
-        RotationalSymmetry(
-            axis / np.linalg.norm(axis), np.zeros(3), fold, 0.0, 0.0, 0.0, True, True
-        )
-        for axis, fold in zip(axes, (2, 4, 2, 2, 2), strict=True)
-    ]
-    group = make_group(turns, 0.2)
+    axes = [[1, 0, 0], [0, 0, 1], [0, 1, 0], [0.748, -0.664, 0], [-0.664, -0.748, 0]]
+    group = make_group(about(axes, (2, 4, 2, 2, 2)), 0.2)
     assert len(group) == 8
     for product in (a @ b for a in group for b in group):
         assert distance_to(group, product) < 1e-9
+
+
+@pytest.mark.parametrize("frame", [0.0, 0.7, 1.1])
+def test_a_badly_measured_axis_that_others_imply_changes_no_turn(frame: float) -> None:
+    """Two axes of a box of square section make its eight symmetries, whatever frame it is in."""
+    axes = np.array([[0, 0, 1], [1, 0, 0], [0, 1, 0], [-0.748, 0.664, 0], [0.664, 0.748, 0.004]])
+    turned = axes @ rotation_about(np.array([0.6, 0.0, 0.8]), frame, np.zeros(3))[:3, :3].T
+    turns = about(turned.tolist(), (4, 2, 2, 2, 2))
+    group = make_group(turns, 0.2)
+    assert len(group) == 8
+    for exact in make_group(turns[:2], 0.2):
+        assert distance_to(group, exact) < 1e-9
+    assert all(is_in_use(turn, group) for turn in turns)
 
 
 def test_every_fold_that_is_tried_has_a_description() -> None:

@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from posefilter.data.augmentation import Augment
+from posefilter.data.augmentation import Augment, ColorJitter
 from posefilter.data.frames import Sample
 from posefilter.data.photometric import (
     ColorResponse,
@@ -34,6 +34,7 @@ OFF = [
     MotionBlur(probability=0),
     Jpeg(probability=0),
     Sticker(probability=0),
+    ColorJitter(0),
 ]
 ON = [
     ColorResponse(),

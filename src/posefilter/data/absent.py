@@ -2,47 +2,35 @@
 
 from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
+from itertools import cycle
 
 import torch
 
 from posefilter.data.frames import FrameRecord
+from posefilter.data.splits import ImageKey, image_key
 from posefilter.types import Batch
 
 
 def find_absent(
     records: Sequence[FrameRecord],
     own: Sequence[FrameRecord],
-    scenes: Mapping[str, Mapping[str, int]],
-    split: str,
     name: str,
     unlisted: Collection[tuple[str, str]] = (),
 ) -> list[FrameRecord]:
     """Return one record of each image in which an object is not listed.
 
-    Scenes in which it is never listed are of no split: where validation and test have scenes, each
-    gets every other one of them, so that what a calibration saw is not tested on.
-
     Args:
         records: Of all classes of a dataset.
         own: Those of the object.
-        scenes: The scenes of each split of the object's records, as `split_record` has them.
-        split: Images are of its scenes, and of its part of those that no split has.
         name: The object's class.
         unlisted: Images that show a class although no record says so, with the class.
     """
-    elsewhere = {scene for part, found in scenes.items() if part != split for scene in found}
-    elsewhere -= set(scenes[split])  # a part may stand for another one's scenes
-    held = [part for part in ("val", "test") if scenes.get(part)]
-    if len(held) == 2 and split in held and set(scenes["val"]) != set(scenes["test"]):
-        taken = {scene for found in scenes.values() for scene in found}
-        free = sorted({record.group for record in records} - taken)
-        elsewhere |= {*free} - {*free[held.index(split) :: 2]}
     showing = {record.name for record in own}
     showing |= {record.name for record in records if record.object == name}
     showing |= {image for image, shown in unlisted if shown == name}
     found: dict[str, FrameRecord] = {}
     for record in records:
-        if record.name not in showing and record.group not in elsewhere:
+        if record.name not in showing:
             found.setdefault(record.name, record)
     return list(found.values())
 
@@ -50,33 +38,73 @@ def find_absent(
 def deal_images(
     found: Sequence[FrameRecord], parts: Mapping[str, Sequence[FrameRecord]], split: str
 ) -> list[FrameRecord]:
-    """Return those of the images that are of a split, where its scenes were cut by images: of each
-    scene a stretch as long as the split's share, so that no two splits have the same.
+    """Return those of the images without an object that are of a split: those of its scenes, and
+    its part of the scenes that no split has.
+
+    Of a scene that was cut by images, each split has a stretch as long as its share, so that no two
+    splits have the same. Stereo pairs stay together, also where one of the two shows the object.
 
     Args:
         found: One record of each image in which the object is not.
-        parts: The object's records in each split, in the order in which scenes were cut.
+        parts: The object's records in each split.
         split: The images' split.
     """
-    own = {record.name for record in parts[split]}
-    apart = [  # less parts that stand for this one
-        part
-        for part, records in parts.items()
-        if part == split or own.isdisjoint(record.name for record in records)
-    ]
-    counts = {part: Counter(record.group for record in parts[part]) for part in apart}
-    by_scene: dict[str, list[str]] = {}
+    # parts have the same records, where one stands for the other, or none in common
+    by_first = {records[0].key: part for part, records in parts.items() if records}
+    owners = {image_key(record): part for part in by_first.values() for record in parts[part]}
+    own = by_first[parts[split][0].key] if parts[split] else None
+    scenes: dict[str, set[ImageKey]] = {}
     for record in found:
-        by_scene.setdefault(record.group, []).append(record.name)
-    kept, at = set[str](), apart.index(split)
-    for scene, names in by_scene.items():
-        sizes = [counts[part][scene] for part in apart]
-        if not any(sizes):  # of no split, and so not cut
-            kept.update(names)
-            continue
-        first, last = (round(len(names) * sum(sizes[:k]) / sum(sizes)) for k in (at, at + 1))
-        kept.update(sorted(names)[first:last])
-    return [record for record in found if record.name in kept]
+        scenes.setdefault(record.group, set()).add(image_key(record))
+    # in the order in which scenes were cut
+    apart = sorted(by_first.values(), key=lambda part: min(map(image_key, parts[part])))
+    counts = {part: Counter(record.group for record in parts[part]) for part in apart}
+    taken = set().union(*counts.values())
+    dealt = _deal_free(sorted(scenes.keys() - taken), counts, own)
+    kept = {image for image, part in owners.items() if part == own}
+    for scene, images in scenes.items():
+        shares = dealt.get(scene, {part: counts[part][scene] for part in apart})
+        kept.update(_take_stretch(sorted(images - owners.keys()), shares, own))
+    return [record for record in found if image_key(record) in kept]
+
+
+def _deal_free(
+    scenes: Sequence[str], counts: Mapping[str, Mapping[str, int]], split: str | None
+) -> dict[str, dict[str | None, int]]:
+    """Return the splits' shares of each of the scenes that none has.
+
+    Where validation and test have images, each gets every other scene, so that what a calibration
+    saw is not tested on; one scene alone is cut where others were. Else a split gets all.
+
+    Args:
+        scenes: In their order.
+        counts: The images of each scene that a split has.
+        split: One of those that have images, or None.
+    """
+    held = [part for part in ("val", "test") if part in counts]
+    if split not in held or len(held) < 2:
+        return {scene: {split: 1} for scene in scenes}
+    cut = len(set().union(*counts.values())) < sum(map(len, counts.values()))
+    if cut and len(scenes) == 1:
+        return {scenes[0]: dict.fromkeys(held, 1)}
+    return {scene: {part: 1} for scene, part in zip(scenes, cycle(held))}
+
+
+def _take_stretch(
+    images: Sequence[ImageKey], shares: Mapping[str | None, int], split: str | None
+) -> Sequence[ImageKey]:
+    """Return a split's images of a scene, whose splits follow each other.
+
+    Args:
+        images: In their order.
+        shares: Of the splits, not all 0.
+        split: Whose images; it may have no share.
+    """
+    if split not in shares:
+        return []
+    sizes, at = [*shares.values()], [*shares].index(split)
+    first, last = (round(len(images) * sum(sizes[:k]) / sum(sizes)) for k in (at, at + 1))
+    return images[first:last]
 
 
 def annotates_one_class(records: Sequence[FrameRecord]) -> bool:

@@ -294,7 +294,7 @@ class ColorJitter:
 
 def jitter_color(rgb: np.ndarray, rng: Generator, strength: float) -> np.ndarray:
     """Return the image (H, W, 3) uint8 as another camera under another light would have taken
-    it.
+    it; with a strength of 0 as it is.
     """
     k = strength
     gain = np.exp(rng.normal(size=3) * 0.1 * k + rng.normal() * 0.25 * k)
@@ -312,4 +312,6 @@ def jitter_color(rgb: np.ndarray, rng: Generator, strength: float) -> np.ndarray
     if rng.random() < 0.5:
         each, common = (rng.standard_normal((*rgb.shape[:2], n), dtype=np.float32) for n in (3, 1))
         out = out + (each + common) * np.float32(0.7 * 255 * 0.06 * k * rng.random() ** 2)
+    if k == 0:  # after all draws, so that later steps have theirs; the table rounds down
+        return rgb
     return np.clip(out, 0, 255).astype(np.uint8)

@@ -309,12 +309,10 @@ class PoseDataModule(LightningDataModule):
             if name in reader.objects:
                 raise
             own = []  # no image of this dataset shows it
-        scenes = self.split_record() if own else {part: {} for part in NAMES}
         unlisted = getattr(reader, "unlisted", ())  # a plug-in's may have none
-        found = find_absent(records, own, scenes, split, name, unlisted)
-        if own:
-            parts = {part: [own[i] for i in self._parts[part]] for part in NAMES}
-            found = deal_images(found, parts, split)
+        found = find_absent(records, own, name, unlisted)
+        parts = {part: [own[i] for i in self._parts[part]] if own else [] for part in NAMES}
+        found = deal_images(found, parts, split)
         if found and annotates_one_class([record for record in records if record.object]):
             log.warning(
                 "%s: each image annotates one class; images that do not annotate %s may show it "

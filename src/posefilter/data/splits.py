@@ -20,6 +20,7 @@ log = logging.getLogger(__name__)
 
 NAMES = ("train", "val", "test")
 _Thing = TypeVar("_Thing", bound=Hashable)
+ImageKey = tuple[str, int]  # the scene and the number of an image, see `image_key`
 Share = float | str | Sequence[str]  # of the scenes; a file that lists frames; scenes by name
 
 
@@ -87,13 +88,18 @@ def split_records(
         left = [(i, owner.get(record.group)) for i, record in enumerate(records)]
     else:
         owner = _divide_images(records, set(scenes), fractions, root)
-        left = [(i, owner.get(_image(record))) for i, record in enumerate(records)]
+        left = [(i, owner.get(image_key(record))) for i, record in enumerate(records)]
     for i, part in left:
         if part is not None:
             out[part].append(i)
     for name in split:
         out[name] = out[_follow(name, split)]
     return out
+
+
+def image_key(record: FrameRecord) -> ImageKey:
+    """Return what the records of one image have in common, those of a stereo pair too."""
+    return record.group, record.im_id
 
 
 def find_learned(
@@ -129,16 +135,11 @@ def _follow(name: str, split: Mapping[str, Share | None]) -> str:
     return passed[-1]
 
 
-def _image(record: FrameRecord) -> tuple[str, int]:
-    """Return what the records of one image have in common, those of a stereo pair too."""
-    return record.group, record.im_id
-
-
 def _divide_images(
     records: Sequence[FrameRecord], scenes: set[str], fractions: Mapping[str, float], root: Path
-) -> dict[tuple[str, int], str]:
+) -> dict[ImageKey, str]:
     """Return the split of each image: blocks of neighbors, since neighbors are alike."""
-    images = sorted({_image(record) for record in records if record.group in scenes})
+    images = sorted({image_key(record) for record in records if record.group in scenes})
     parts = ", ".join(fractions)
     if not records:
         raise UserError(f"data.root: no frames in {root}")

@@ -2,12 +2,15 @@
 depth below it.
 """
 
+from collections.abc import Sequence
+
 import cv2
 import numpy as np
 from matplotlib import colormaps
 
-from posefilter.data.frames import Sample
+from posefilter.data.frames import FrameRecord, Sample
 from posefilter.data.readers.base import BaseReader
+from posefilter.data.splits import ImageKey, image_key
 from posefilter.errors import BadData
 from posefilter.figures.canvas import PAPER, TRUTH, arrange_grid, draw_row, full_view
 from posefilter.figures.layout import DETAIL, draw_legend, draw_scale
@@ -21,21 +24,21 @@ _UNKNOWN = (40, 40, 40)
 def draw_preview(reader: BaseReader, name: str, frames: int, count: int = 4) -> np.ndarray | None:
     """Return `count` of a dataset's frames, spread evenly, each with its depth below it.
 
-    Frames that cannot be read are left out; None where that leaves none, or none shows the object.
+    A frame of two cameras is shown as one of them sees it. Frames that cannot be read are left out;
+    None where that leaves none, or none shows the object.
     """
-    found: list[tuple[str, Sample]] = []
     records = reader.records()
-    spread = np.linspace(0, len(records) - 1, min(count, len(records)))
-    for i in np.unique(spread.round().astype(int)):
-        try:
-            found.append((records[i].name, reader.read(int(i))))
-        except BadData:
-            continue
+    images = _list_images(records)
+    spread = np.linspace(0, len(images) - 1, min(count, len(images)))
+    chosen = [images[i] for i in np.unique(spread.round().astype(int))]
+    read = [(records[image[0]].name, _read_instances(reader, image)) for image in chosen]
+    found = [(title, samples) for title, samples in read if samples]
     if not found:
         return None
-    known = np.concatenate([sample.depth[sample.depth > 0] for _, sample in found])
+    depths = [samples[0].depth for _, samples in found]
+    known = np.concatenate([depth[depth > 0] for depth in depths])
     near, far = np.quantile(known, [0.01, 0.99])
-    tiles = [draw_frame(sample, name, float(near), float(far)) for name, sample in found]
+    tiles = [draw_frame(samples, title, float(near), float(far)) for title, samples in found]
     if len(tiles) == 1:  # the rows above and below need the width of two
         tiles.append(np.full_like(tiles[0], 255))
     figure = arrange_grid(tiles, len(tiles))
@@ -46,14 +49,39 @@ def draw_preview(reader: BaseReader, name: str, frames: int, count: int = 4) -> 
     )
 
 
-def draw_frame(sample: Sample, name: str, near: float, far: float) -> np.ndarray:
-    """Return a frame's name, its photograph, and its depth colored from `near` to `far` [m]."""
+def _list_images(records: Sequence[FrameRecord]) -> list[list[int]]:
+    """Return an image of each frame, as the indices of its records: one an instance."""
+    images: dict[ImageKey, list[int]] = {}
+    for i, record in enumerate(records):
+        listed = images.setdefault(image_key(record), [])
+        if not listed or records[listed[0]].name == record.name:  # else of the other camera
+            listed.append(i)
+    return list(images.values())
+
+
+def _read_instances(reader: BaseReader, image: Sequence[int]) -> list[Sample]:
+    """Return those of an image's instances that can be read."""
+    found = []
+    for index in image:
+        try:
+            found.append(reader.read(index))
+        except BadData:
+            continue
+    return found
+
+
+def draw_frame(instances: Sequence[Sample], name: str, near: float, far: float) -> np.ndarray:
+    """Return a frame's name, its photograph with the instances outlined, and its depth colored from
+    `near` to `far` [m].
+    """
+    sample = instances[0]
     height, width = sample.mask.shape
     view = full_view(height, width, _TILE)
     size = (view.width, view.height)
     how = cv2.INTER_AREA if view.scale < 1 else cv2.INTER_CUBIC
     photo = cv2.resize(sample.rgb, size, interpolation=how)
-    view.outline(photo, trace_outline(sample.mask), TRUTH, 1)
+    for instance in instances:
+        view.outline(photo, trace_outline(instance.mask), TRUTH, 1)
     share = (np.clip(sample.depth, near, far) - near) / max(far - near, 1e-9)
     depth = (_DEPTH(share)[..., :3] * 255).astype(np.uint8)
     depth[sample.depth <= 0] = _UNKNOWN

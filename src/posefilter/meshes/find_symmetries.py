@@ -1,7 +1,9 @@
 """Find an object's symmetries: turns that move its surface, and its texture, onto themselves.
 
 Candidate axes are the principal axes of the surface, the axes of its smallest oriented box, and two
-directions that every turn of it keeps: a cone about as wide as high has no other axis.
+directions that every turn of it keeps: a cone about as wide as high has no other axis.  The
+principal axes of a solid with several axes of third turns, such as an octahedron, are arbitrary:
+then the directions of its large flat faces are tried, too.
 About each, turns by a half, a third and a quarter are tried, and some by angles that divide no
 circle, which stand for any turn.  A turn is first refined by registering the turned surface with
 itself, since a scan's axes are not exact, and is then judged by distances of turned surface samples
@@ -39,6 +41,11 @@ MOST_COLOR = 0.18
 _SAMPLES, _DENSE = 3000, 20000
 _ANY_ANGLES = tuple(2 * np.pi * k * 0.381966 for k in (1, 2, 3))  # by the golden angle
 _LEAST_MOMENT = 0.01  # of the mean (cubed) distance; what samples of a symmetric shape stay below
+_ALIKE = 0.9  # the smallest standard deviation by the largest, of a solid without principal axes
+# of the hull's area, what two opposite faces have at least, of an icosahedron a tenth; normals of a
+# face, measured, are within 5 degrees
+_LEAST_FACE, _ONE_FACE = 0.04, np.cos(np.deg2rad(5.0))
+_MOST_TRIANGLES = 200  # that are looked at, the largest first
 _COARSE = 0.03  # [diameters] a candidate that is farther off before its refinement is none
 
 
@@ -95,19 +102,39 @@ def _sample(mesh: Mesh) -> _Surface:
 
 def _candidate_axes(mesh: Mesh, surface: _Surface) -> list[np.ndarray]:
     """Return the principal axes of the surface, the axes of its smallest oriented box, and the
-    directions of its third moment and of the middle of its convex hull, where they are not zero.
+    directions of its third moment and of the middle of its convex hull, where they are not zero; of
+    a solid whose moments of inertia are alike also those of its hull's faces.
     """
     hull = hull_vertices(mesh.vertices)
-    principal = np.linalg.svd(surface.points - surface.points.mean(0), full_matrices=False)[2]
+    deviations, principal = np.linalg.svd(
+        surface.points - surface.points.mean(0), full_matrices=False
+    )[1:]
     box = trimesh.bounds.oriented_bounds(hull)[0][:3, :3]
     middle = surface.dense.mean(0)
     centered = surface.dense - middle
     away = np.linalg.norm(centered, axis=1, keepdims=True)
     third = (away**2 * centered).mean(0) / (away**3).mean()
+    solid = trimesh.convex.convex_hull(hull)
     with np.errstate(divide="ignore", invalid="ignore"):  # of a flat mesh without a volume
-        to_hull = (trimesh.convex.convex_hull(hull).center_mass - middle) / away.mean()
+        to_hull = (solid.center_mass - middle) / away.mean()
     sizes = ((one, float(np.linalg.norm(one))) for one in (third, to_hull))
-    return [*principal, *box, *(one / size for one, size in sizes if _LEAST_MOMENT < size < 1)]
+    moments = (one / size for one, size in sizes if _LEAST_MOMENT < size < 1)
+    faces = _face_axes(solid) if deviations[2] > _ALIKE * deviations[0] else []
+    return [*principal, *box, *moments, *faces]
+
+
+def _face_axes(solid: trimesh.Trimesh) -> list[np.ndarray]:
+    """Return the directions of a convex solid's large flat faces, one of opposite ones."""
+    normals, areas, axes = solid.face_normals, np.array(solid.area_faces), []
+    least = _LEAST_FACE * areas.sum()
+    for triangle in np.argsort(-areas)[:_MOST_TRIANGLES]:
+        along = normals @ normals[triangle]
+        weights = np.where(np.abs(along) > _ONE_FACE, np.sign(along) * areas, 0)
+        if np.abs(weights).sum() >= least:
+            axis = weights @ normals
+            axes.append(axis / np.linalg.norm(axis))
+            areas[weights != 0] = 0  # of this face no other axis is made
+    return axes
 
 
 def _try(

@@ -75,8 +75,8 @@ def make_group(turns: Sequence[RotationalSymmetry], size: float, steps: int = 36
 def list_discrete(turns: Sequence[RotationalSymmetry], size: float) -> list[np.ndarray]:
     """Return every product of the discrete turns but the identity, (4, 4) each.
 
-    A turn whose products with those before it, which fit better, do not close, as they do in a
-    group, is left out: its axis is measured too badly.
+    A turn that is a product of those before it, which fit better, adds nothing. One whose products
+    with them do not close, as they do in a group, is left out: its axis is measured too badly.
     """
     kept: list[np.ndarray] = []
     # a far origin moves by more than the object does
@@ -87,7 +87,10 @@ def list_discrete(turns: Sequence[RotationalSymmetry], size: float) -> list[np.n
     for turn in turns:
         if turn.fold == ANY:
             continue
-        more = [*kept, rotation_about(turn.axis, 2 * np.pi / turn.fold, turn.point)]
+        own = rotation_about(turn.axis, 2 * np.pi / turn.fold, turn.point)
+        if not all(_differ(own, one, size, middle) for one in group):
+            continue  # a product of turns that fit better: its own error would add to theirs
+        more = [*kept, own]
         products = _close(more, size, middle)
         if len(products) <= _MOST_ELEMENTS and min(map(measure_angle, products[1:])) > _SMALLEST:
             kept, group = more, products
