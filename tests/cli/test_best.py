@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from torch.utils.data import DataLoader
 
 from posefilter.cli.best import Best, Last, check_kept
-from posefilter.cli.stopping import Stop
+from posefilter.cli.stopping import FinalValidation, Stop
 from posefilter.cli.train import check_validated
 from posefilter.errors import Stopped, UserError
 
@@ -25,6 +25,7 @@ class Scored(LightningModule):
     def __init__(self, scores: list[float]) -> None:
         super().__init__()
         self.scores = iter(scores)
+        self.validated: list[int] = []  # at these steps
         self.weight = nn.Parameter(torch.zeros(()))
 
     def training_step(self, batch: Tensor, index: int) -> Tensor:
@@ -32,6 +33,7 @@ class Scored(LightningModule):
 
     def validation_step(self, batch: Tensor, index: int) -> None:
         self.log("val/score", next(self.scores))
+        self.validated.append(self.global_step)
 
     def configure_optimizers(self) -> torch.optim.Optimizer:
         return torch.optim.SGD(self.parameters(), lr=0.1)
@@ -64,6 +66,69 @@ def test_of_equal_validations_the_latest_is_kept(
     trainer.fit(Scored(scores), one, one)
     assert torch.load(tmp_path / "best.ckpt", weights_only=True)["global_step"] == step
     assert [path.name for path in tmp_path.iterdir()] == ["best.ckpt"]
+
+
+def fit_epochs(
+    folder: Path, changed: dict[str, Any], start: Path | None = None, minutes: float = 3.0
+) -> list[int]:
+    """Train for two epochs of four batches; return the steps that were validated."""
+    keep = Best(dirpath=folder, filename="best", monitor="val/score", mode="max")
+    settings = {"max_epochs": 2, "val_check_interval": 5, "check_val_every_n_epoch": None}
+    trainer = Trainer(
+        **{**settings, **changed},
+        callbacks=[keep, Last(str(folder), minutes), FinalValidation()],
+        logger=False,
+        accelerator="cpu",
+        enable_progress_bar=False,
+        enable_model_summary=False,
+        num_sanity_val_steps=0,
+    )
+    method, four = Scored([0.0] * 9), DataLoader(torch.zeros(4, 1))
+    trainer.fit(method, four, DataLoader(torch.zeros(1, 1)), ckpt_path=start, weights_only=True)
+    return method.validated
+
+
+EACH_EPOCH = {"check_val_every_n_epoch": 1, "val_check_interval": 1.0}
+
+
+@pytest.mark.parametrize(
+    ("changed", "validated"),
+    [
+        ({}, [5, 8]),
+        ({"val_check_interval": 50}, [8]),
+        ({"val_check_interval": 4}, [4, 8]),  # once where one is due anyway
+        ({"max_steps": 100}, [5, 8]),
+        ({"max_steps": 7, "max_epochs": -1}, [5, 7]),
+        ({"limit_train_batches": 3}, [5, 6]),
+        ({"accumulate_grad_batches": 3}, [2, 4]),  # a step is of three batches, and of the rest
+        ({"min_epochs": 2}, [5, 8]),
+        (EACH_EPOCH, [4, 8]),
+        ({**EACH_EPOCH, "val_check_interval": 0.75}, [3, 7, 8]),
+        ({**EACH_EPOCH, "check_val_every_n_epoch": 2}, [8]),
+    ],
+)
+@pytest.mark.filterwarnings("ignore:Checkpoint directory", "ignore:.*dirpath has changed")
+@pytest.mark.filterwarnings("ignore:You're resuming")
+@pytest.mark.filterwarnings("ignore:.*could not find the monitored key")  # where none was left
+def test_the_last_step_is_validated_and_no_other_follows_when_it_is_resumed(
+    changed: dict[str, Any], validated: list[int], tmp_path: Path
+) -> None:
+    assert fit_epochs(tmp_path, changed) == validated
+    read = {p: torch.load(tmp_path / p, weights_only=True) for p in ("best.ckpt", "last.ckpt")}
+    assert {one["global_step"] for one in read.values()} == {validated[-1]}
+    assert fit_epochs(tmp_path, changed, tmp_path / "last.ckpt") == []
+    again = torch.load(tmp_path / "last.ckpt", weights_only=True)
+    assert again["global_step"] == validated[-1]
+    if len(validated) > 1:  # one that was cut short does as much
+        before = tmp_path / "last.previous.ckpt"
+        assert fit_epochs(tmp_path / "again", changed, before) == validated[-1:]
+
+
+@pytest.mark.filterwarnings("ignore:Checkpoint directory", "ignore:You're resuming")
+def test_nothing_is_resumed_amid_the_validation_of_the_last_step(tmp_path: Path) -> None:
+    """It would not be gone on with."""
+    fit_epochs(tmp_path, {}, minutes=0)  # the last but one is the one before that validation
+    assert fit_epochs(tmp_path, {}, tmp_path / "last.previous.ckpt") == [8]
 
 
 @pytest.mark.parametrize("moved", [False, True])
@@ -274,11 +339,11 @@ EVERY_SECOND = {"check_val_every_n_epoch": 2, "val_check_interval": 1.0}
         ({"limit_test_batches": 0}, "trainer.limit_test_batches=0: "),
         ({"limit_test_batches": 0.2}, "trainer.limit_test_batches=0.2: of 3 batches this is none"),
         ({"limit_test_batches": 0.4, "max_epochs": 3}, None),
-        ({"max_epochs": 2}, "trainer.max_epochs=2: 8 batches, and the first validation is"),
-        ({"max_epochs": 3}, None),
-        ({"max_epochs": 3, "limit_train_batches": 2}, "trainer.max_epochs=3: 6 batches"),
-        ({"max_epochs": 5, "limit_train_batches": 0.5}, None),
+        ({"limit_train_batches": 0.2}, "trainer.limit_train_batches=0.2: of 4 batches this is no"),
+        ({"max_epochs": 2}, None),  # 8 batches: validated at the end
         ({"max_epochs": 1, "check_val_every_n_epoch": 1, "val_check_interval": 1.0}, None),
+        ({**EVERY_SECOND, "max_epochs": 2}, None),
+        ({**EVERY_SECOND, "max_epochs": 1}, "trainer.check_val_every_n_epoch=2: trainer.max_e"),
         ({**EVERY_SECOND, "max_steps": 7}, "trainer.check_val_every_n_epoch=2: an epoch has 4"),
         ({**EVERY_SECOND, "max_steps": 7, "limit_train_batches": 3}, None),
     ],

@@ -3,6 +3,7 @@
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import pytest
 import torch
@@ -21,7 +22,9 @@ CONF = Path(__file__).parents[2] / "conf"
     ("common", "changed", "same"),
     [
         ([], ["filter.particles=50"], True),
-        ([], ["filter/refine=none", "data.limit_test=3", "threads=2", "out=elsewhere"], True),
+        ([], ["filter/refine=none", "data.limit_test=3", "data.workers=2", "out=elsewhere"], True),
+        ([], ["threads=2"], False),  # null is the machine's number
+        (["threads=2"], ["filter.particles=50"], True),
         ([], ["train_pixels=32"], False),
         ([], ["seed=1"], False),
         ([], ["trainer.max_steps=7"], False),
@@ -85,3 +88,37 @@ def test_what_another_job_has_learned_comes_without_its_calibration(
     monkeypatch.setattr(reuse, "recipe", lambda job: {"settings": {}})  # of the same filter
     assert take_over(job) is not None  # type: ignore[arg-type]
     assert torch.load(tmp_path / "1_b" / "checkpoints" / "best.ckpt", weights_only=True) == other
+
+
+@pytest.mark.parametrize(
+    ("changed", "reason", "seconds"),
+    [
+        ({"data": {"workers": 2}}, "training does not depend on data.workers, but its best", None),
+        ({"logger": {"csv": None}}, "learned; its best", 3.0),
+        (
+            {"data": {"workers": 2, "limit_test": 3}},
+            "training does not depend on data.limit_test, data.workers, but its best",
+            None,
+        ),
+    ],
+)
+def test_what_is_taken_over_leaves_out_the_speed_of_other_workers(
+    changed: dict[str, Any], reason: str, seconds: float | None,
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str],
+) -> None:  # fmt: skip
+    """And says on which settings the training does not depend, where there are any."""
+    for name in ("0_a", "1_b"):
+        (tmp_path / name / "checkpoints").mkdir(parents=True)
+    settings: dict[str, Any] = {"data": {"workers": 0}}
+    then, now = ({"choices": {}, "settings": one} for one in (settings, settings | changed))
+    torch.save({"recipe": then}, tmp_path / "0_a" / "checkpoints" / "best.ckpt")
+    known = {"learned_from": "this", "seconds_per_step": 3.0, "cpu_seconds_per_step": 3.0}
+    monkeypatch.setattr(reuse, "own_metrics", lambda folder: {"training": known})
+    monkeypatch.setattr(reuse, "learned_from", lambda job: "this")
+    monkeypatch.setattr(reuse, "recipe", lambda job: now)
+    monkeypatch.setattr(reuse, "read_checkpoint", lambda file: {"recipe": then})
+    job = SimpleNamespace(swept=True, folder=tmp_path / "1_b", cfg=SimpleNamespace(console="rich"))
+    taken = take_over(job)  # type: ignore[arg-type]
+    assert taken is not None
+    assert [taken[key] for key in ("seconds_per_step", "cpu_seconds_per_step")] == [seconds] * 2
+    assert reason in " ".join(capsys.readouterr().out.split())

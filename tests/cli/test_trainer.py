@@ -7,10 +7,12 @@ from pathlib import Path
 
 import pytest
 import torch
+from lightning.pytorch.accelerators import CPUAccelerator
 from omegaconf import OmegaConf
 
 from posefilter.cli import run_command
 from posefilter.cli.build import list_swept, make_trainer, quiet
+from posefilter.cli.evaluate import make_tester
 from posefilter.cli.job import Job
 from posefilter.errors import UserError
 
@@ -71,6 +73,28 @@ def test_one_of_several_processes_does_not_train_alone(monkeypatch: pytest.Monke
         make_trainer(OmegaConf.create({**SETTINGS, "devices": 1}), [])
     strategy = {"devices": 2, "strategy": "ddp"}
     assert make_trainer(OmegaConf.create({**SETTINGS, **strategy}), []).world_size == 2
+
+
+@pytest.mark.parametrize("typed", ["trainer.devices=2", "+trainer.num_nodes=2"])
+def test_a_test_in_several_processes_is_refused_before_any_other_is_started(
+    typed: str, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """Lightning ends all by SIGKILL once the second is refused as one too many."""
+    words = [typed, "checkpoint=none.ckpt", f"out={tmp_path / 'x'}"]
+    assert run_command("evaluate", HOME, words) == 2
+    told = f"{typed.removeprefix('+')}: evaluate tests in one process; leave it at 1"
+    assert capfd.readouterr().err == f"evaluate: {told}\n"
+
+
+def test_a_test_on_all_devices_is_refused_where_there_are_several(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """`auto` is known once the machine was asked."""
+    settings = OmegaConf.create({**SETTINGS, "devices": "auto"})
+    assert make_tester(settings, []).world_size == 1
+    monkeypatch.setattr(CPUAccelerator, "auto_device_count", staticmethod(lambda: 2))
+    with pytest.raises(UserError, match=r"^trainer\.devices=auto: evaluate tests in one process"):
+        make_tester(settings, [])
 
 
 @pytest.mark.parametrize("precision", ["bf16-mixed", "16-true", "64-true"])

@@ -108,7 +108,7 @@ REFUSED = {
     "check_data": {"max_frames": (0, -1, 10**21)},
     "export": {"points": (0,), "max_mb": (0, None)},
     "onboard": {"budget_minutes": (0, None, math.nan), "steps": (0,), "workers": (0,)},
-    "evaluate": {"threads": (0,)},
+    "evaluate": {"threads": (0,), "trainer.devices": (2, [0, 1])},  # tests in one process
 }
 CASES = [
     (command, key, value)

@@ -19,6 +19,7 @@ from posefilter.report.sweep_page import (
     format_mean,
     format_spread,
     head_lines,
+    list_notes,
     make_sweep_page,
 )
 from posefilter.report.sweeps import (
@@ -158,6 +159,49 @@ def test_detectors_that_tie_have_no_median(tmp_path: Path) -> None:
     found = Sweep(tmp_path, ["filter.particles", "seed"], seeds, [])
     head = str(head_lines(found, find_best_job(found))[0])
     assert "(box IoU 0.500 ± 0.000, particles on the object 70.0 ± 0.0, mean of 2 seeds)" in head
+
+
+@pytest.mark.parametrize("seeds", [1, 2])
+def test_detectors_and_methods_of_poses_are_ranked_by_what_both_have(
+    seeds: int, tmp_path: Path
+) -> None:
+    """By its own score the detector has 65, and the others 40 and 50."""
+    rows = {
+        "cnn_patch": {"iou": 0.6, "particles_on_object": 0.7},
+        "pose_pf": {"iou": 0.7, "particles_on_object": 0.8, "add/auc": 40.0},
+        "pixel_pf": {"iou": 0.5, "particles_on_object": 0.1, "add/auc": 50.0},
+    }
+    jobs = [
+        Job({"model": name, "seed": seed}, {**numbers, "seconds_per_image": 1.0}, f"{name}_{seed}")
+        for name, numbers in rows.items()
+        for seed in range(seeds)
+    ]
+    found = Sweep(tmp_path, ["model", "seed"], jobs, [])
+    assert find_best_job(found).place["model"] == "pose_pf"
+    assert find_ties(found) == seeds
+    page = make_sweep_page(found, None, None, "x")
+    assert any("by the mean of the particles on the object and the" in note for note in page.notes)
+    head = str(head_lines(found, find_best_job(found))[0])
+    assert ("(box IoU 0.700 ± 0.000, particles on the object 80.0" in head) == (seeds > 1)
+    (panel,) = chart_against_time(group_jobs(found))
+    assert (panel.title, len(panel.lines)) == ("particles on the object", 3)
+    figure = draw_summary(found)
+    assert figure is not None
+    assert figure.axes[0].get_title(loc="left") == "ADD AUC"  # of those that have it
+
+    poses = Sweep(tmp_path, ["model", "seed"], jobs[seeds:], [])
+    assert find_best_job(poses).place["model"] == "pixel_pf"
+    assert not any("predict no pose" in note for note in list_notes(poses, None))
+
+
+def test_runs_of_both_kinds_that_tie_have_no_median(tmp_path: Path) -> None:
+    numbers = {"iou": 0.5, "particles_on_object": 0.7}
+    pose = numbers | {"add/auc": 50.0, "add/median_mm": 4.0}
+    jobs = [Job({"model": name}, own, name) for name, own in (("a", numbers), ("b", pose))]
+    found = Sweep(tmp_path, ["model"], jobs, [])
+    head = str(head_lines(found, find_best_job(found))[0])
+    assert "model=a" in head
+    assert "2 runs have its score to one decimal; it is the first of them" in head
 
 
 def test_where_scores_tie_the_median_names_the_best(sweep: Path) -> None:

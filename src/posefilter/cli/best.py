@@ -12,7 +12,7 @@ from lightning.pytorch.callbacks import Checkpoint, ModelCheckpoint
 from torch import Tensor
 
 from posefilter.cli.resume import BEFORE, LAST
-from posefilter.cli.stopping import any_process, asked_to_stop, is_accumulating
+from posefilter.cli.stopping import any_process, asked_to_stop, is_accumulating, is_over
 from posefilter.errors import UserError
 from posefilter.metrics.registry import HIGHER, LOWER, find_metric
 
@@ -125,8 +125,7 @@ class Last(Checkpoint):
 
     def _save_amid_validation(self, trainer: Trainer, *_: Any, **__: Any) -> None:
         # a run that has all its steps would not go on with its validation
-        ended = trainer.global_step == trainer.max_steps
-        if self._due(trainer) and not trainer.sanity_checking and not ended:
+        if self._due(trainer) and not trainer.sanity_checking and not is_over(trainer):
             self._validation_due = True
             self._save(trainer)
             self._validation_due = False

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from lightning import Callback, Trainer
 from omegaconf import DictConfig, OmegaConf
 
 from posefilter.callbacks.errors import ErrorTable, make_rows
@@ -105,7 +106,7 @@ def _of_checkpoint(job: Job) -> tuple[dict[str, Any], dict[str, Path]]:
     warn_of_learned(str(job.cfg.checkpoint), data, job.cfg.console)
     records = Records()
     callbacks = [records, ErrorTable(job.folder), progress(job.cfg.console)]
-    trainer = make_trainer(job.cfg.trainer, callbacks)
+    trainer = make_tester(job.cfg.trainer, callbacks)
     if trainer.limit_test_batches == 0:
         raise UserError("trainer.limit_test_batches=0: leaves nothing to test")
     device = trainer.strategy.root_device
@@ -122,6 +123,21 @@ def _of_checkpoint(job: Job) -> tuple[dict[str, Any], dict[str, Path]]:
     source = Path(job.cfg.checkpoint)
     found = record(method.compute_metrics(), tested, data.describe(), source, device)
     return found, files
+
+
+def make_tester(node: DictConfig, callbacks: list[Callback]) -> Trainer:
+    """Build a trainer that tests in this process.
+
+    Raises:
+        UserError: It would start others, as for each device that `auto` finds.
+    """
+    trainer = make_trainer(node, callbacks)
+    if trainer.world_size > 1:
+        raise UserError(
+            f"trainer.devices={node.get('devices')}: evaluate tests in one process, and this would "
+            f"be {trainer.world_size}; leave it at 1"
+        )
+    return trainer
 
 
 def warn_of_several(data: PoseDataModule, console: str) -> None:

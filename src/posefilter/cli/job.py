@@ -177,7 +177,10 @@ def check_settings(cfg: DictConfig, command: str, choices: Mapping[str, str] | N
         if plain.get(key) is None:
             raise UserError(f"{key}=null: {command} requires a value; leave it out for the default")
     check_ranges(_resolve(cfg), command)  # what is made of other settings, too
-    accelerator = (plain.get("trainer") or {}).get("accelerator", "auto")
+    trainer = plain.get("trainer") or {}
+    if command == "evaluate":
+        _check_alone(trainer)
+    accelerator = trainer.get("accelerator", "auto")
     if accelerator not in _ACCELERATORS:
         raise UserError(
             f"trainer.accelerator={accelerator}: there is none of this name; choose "
@@ -188,3 +191,14 @@ def check_settings(cfg: DictConfig, command: str, choices: Mapping[str, str] | N
         raise UserError(f"tags={tags}: must be a list of words, such as tags=[first]")
     if cfg.get("console", "json") not in ("rich", "json"):
         raise UserError(f"console={cfg.console}: choose rich or json")
+
+
+def _check_alone(trainer: Mapping[str, Any]) -> None:
+    """Refuse the settings of a trainer that would test in several processes: Lightning ends all of
+    them by a signal once the second is refused as one too many.
+    """
+    for key in ("devices", "num_nodes"):
+        asked = trainer.get(key)
+        count = len(asked) if isinstance(asked, list) else asked
+        if isinstance(count, int) and count > 1:  # what `auto` stands for is known later
+            raise UserError(f"trainer.{key}={asked}: evaluate tests in one process; leave it at 1")

@@ -14,12 +14,15 @@ from posefilter.cli.files import save_whole
 from posefilter.cli.folders import own_metrics, read_results
 from posefilter.cli.instantiate import locate
 from posefilter.cli.job import Job
-from posefilter.cli.plain import resolve
+from posefilter.cli.plain import find, resolve
 from posefilter.cli.resume import BEFORE, LAST, last_checkpoints
 from posefilter.errors import UserError
 
-_LEARNED_FROM = ("model", "data", "trainer", "callbacks", "seed", "warm_start")
+# threads: another number adds up a gradient in another order, so that its last digits differ
+_LEARNED_FROM = ("model", "data", "trainer", "callbacks", "seed", "warm_start", "threads")
 _TESTED_WITH = ("limit_test", "workers", "progress")  # of the data
+_WORKERS = "data.workers"  # with other ones the same is learned, at another speed
+_SPEEDS = ("seconds_per_step", "cpu_seconds_per_step")
 
 
 def finished(job: Job) -> dict[str, Any] | None:
@@ -73,7 +76,8 @@ def take_over(job: Job) -> dict[str, Any] | None:
     """Take the checkpoints of another job of the sweep that has learned what this one would.
 
     Returns:
-        The other's record of its training; None where there is no such job.
+        The other's record of its training, less its speed where this job would have another; None
+        where there is no such job.
     """
     if not job.swept:
         return None
@@ -83,16 +87,20 @@ def take_over(job: Job) -> dict[str, Any] | None:
         training = own_metrics(folder).get("training", {}) if best.is_file() else {}
         if folder == job.folder or training.get("learned_from") != wanted:
             continue
-        now = recipe(job)
         checkpoint = read_checkpoint(best)
-        others = ", ".join(differing(checkpoint["recipe"], now))
-        if not is_calibrated_filter(now["settings"], checkpoint["recipe"]["settings"]):
+        then, now = checkpoint["recipe"], recipe(job)
+        others = differing(then, now)
+        if find(then["settings"], _WORKERS) != find(now["settings"], _WORKERS):
+            others.append(_WORKERS)
+            training = {**training, **dict.fromkeys(_SPEEDS)}
+        if not is_calibrated_filter(now["settings"], then["settings"]):
             checkpoint.pop("calibration", None)
         save_whole({**checkpoint, "recipe": now}, job.folder / "checkpoints" / "best.ckpt")
+        # there are none where what differs is no setting of a training, as a logger
+        reason = f"training does not depend on {', '.join(others)}, but " if others else ""
         sentence = (
-            f"{job.folder.name}: only tested, with what {folder.name} has learned; "
-            f"training does not depend on {others}, but its best checkpoint was chosen by "
-            f"validations of {folder.name}"
+            f"{job.folder.name}: only tested, with what {folder.name} has learned; {reason}its "
+            f"best checkpoint was chosen by validations of {folder.name}"
         )
         say(job.cfg.console, "reused", sentence, run=str(job.folder), trained=str(folder))
         return {**training, "trained_as": folder.name}

@@ -16,13 +16,30 @@ from posefilter.errors import Stopped
 
 class FinalValidation(Callback):
     """Validate after the step that ends a training, too: Lightning validates at multiples of
-    `val_check_interval` alone, so that the best checkpoint could hold no later step.
+    `val_check_interval` alone, so that the best checkpoint could hold no later step. Epochs that
+    `check_val_every_n_epoch` leaves out stay without.
     """
+
+    def on_train_start(self, trainer: Trainer, *_: Any) -> None:
+        """Do no more where a run goes on from the validation after its last batch: Lightning, which
+        had none planned there, would begin another.
+        """
+        loop = trainer.fit_loop
+        assert loop._data_fetcher is not None
+        if is_over(trainer) and not loop.epoch_loop._should_check_val_fx(loop._data_fetcher):
+            _stop(trainer)
 
     def on_train_batch_end(self, trainer: Trainer, *_: Any) -> None:
         """Stop at the last step, as Lightning would by itself; before a stop it validates."""
-        if 0 < trainer.max_steps <= trainer.global_step:
-            trainer.should_stop = True
+        if is_over(trainer):
+            _stop(trainer)
+
+
+def _stop(trainer: Trainer) -> None:
+    loop = trainer.fit_loop
+    # the last epoch counts as done only later: it would hold up the stop, and its validation
+    loop.min_epochs = loop.epoch_loop.min_steps = None
+    trainer.should_stop = True
 
 
 class Stop(Callback):
@@ -90,6 +107,13 @@ def stopped_by_interrupt() -> Iterator[None]:
         if isinstance(ended.__context__, KeyboardInterrupt):
             raise Stopped(signal.SIGINT) from ended
         raise
+
+
+def is_over(trainer: Trainer) -> bool:
+    """Tell whether a training has had its last batch, by its steps or by its epochs."""
+    by_steps = 0 < trainer.max_steps <= trainer.global_step
+    epochs = trainer.max_epochs or -1
+    return by_steps or (trainer.is_last_batch and 0 < epochs <= trainer.current_epoch + 1)
 
 
 def is_accumulating(trainer: Trainer) -> bool:

@@ -200,17 +200,12 @@ def check_validated(run: Run) -> None:
     for name, what in needed.items():
         if getattr(trainer, name) == 0:
             raise UserError(f"trainer.{name}=0: a training needs {what}")
-    share = trainer.limit_test_batches
-    few = isinstance(share, float) and share < 1
-    if few and not count_batches(tested := len(run.data.test_dataloader()), share):
-        raise UserError(
-            f"trainer.limit_test_batches={share}: of {tested} batches this is none, and a training "
-            "ends with its test"
-        )
-    batches = count_batches(len(run.data.train_dataloader()), trainer.limit_train_batches)
-    _check_epochs(trainer, batches)
+    _check_share(run, "train")
+    _check_share(run, "test")
+    _check_epochs(trainer)
     if every is None or trainer.max_steps < 0:
         return
+    batches = count_batches(len(run.data.train_dataloader()), trainer.limit_train_batches)
     last = interval if isinstance(interval, int) else math.ceil(interval * batches)
     step = ((every - 1) * batches + last) // trainer.accumulate_grad_batches
     if step > trainer.max_steps:
@@ -221,15 +216,26 @@ def check_validated(run: Run) -> None:
         )
 
 
-def _check_epochs(trainer: Trainer, batches: int) -> None:
-    """Refuse epochs that end before the first validation, which counts batches."""
-    epochs, interval = trainer.max_epochs, trainer.val_check_interval
-    by_batches = trainer.check_val_every_n_epoch is None and isinstance(interval, int)
-    if by_batches and epochs is not None and 0 <= epochs * batches < interval:
+def _check_share(run: Run, split: str) -> None:
+    """Refuse a share of a split's batches that is none of them."""
+    share = getattr(run.trainer, f"limit_{split}_batches")
+    if not (isinstance(share, float) and share < 1):
+        return
+    there = len(getattr(run.data, f"{split}_dataloader")())
+    if not count_batches(there, share):
+        why = {"train": "there would be no step", "test": "a training ends with its test"}[split]
         raise UserError(
-            f"trainer.max_epochs={epochs}: {epochs * batches} batches, and the first validation is "
-            f"after {interval} (trainer.val_check_interval), so that there would be no best "
-            "checkpoint"
+            f"trainer.limit_{split}_batches={share}: of {there} batches this is none, and {why}"
+        )
+
+
+def _check_epochs(trainer: Trainer) -> None:
+    """Refuse epochs that end before the first that is validated."""
+    epochs, every = trainer.max_epochs, trainer.check_val_every_n_epoch
+    if epochs is not None and every is not None and 0 <= epochs < every:
+        raise UserError(
+            f"trainer.check_val_every_n_epoch={every}: trainer.max_epochs={epochs} end before the "
+            "first validation, so that there would be no best checkpoint"
         )
 
 

@@ -17,10 +17,18 @@ from posefilter.report.charts import (
     draw_panel,
     measure_height,
 )
-from posefilter.report.sweeps import Group, Sweep, Value, group_jobs, list_judging
+from posefilter.report.sweeps import (
+    DETECTING,
+    Group,
+    Sweep,
+    Value,
+    find_auc,
+    group_jobs,
+    list_judging,
+)
 
 MOST_LINES = 6  # values of a second axis that become lines, settings that get a name
-SUMMED = ("iou", "particles_on_object", "seconds_per_image")  # beside what the score is made of
+SUMMED = (*DETECTING, "seconds_per_image")  # beside what poses are scored by
 _TITLE_PX = 60
 
 
@@ -100,7 +108,7 @@ def chart_against_time(found: Sequence[Group]) -> list[Panel]:
     if len(found) < 2:
         return []
     cost = find_metric("seconds_per_image")
-    # what sweeps maximize; of a detector, the second part of it
+    # what the best has most of; of detectors, the second part of it
     for info in map(find_metric, list_judging([job for one in found for job in one.jobs])[-1:]):
         lines = [
             Line(spell(one.place), [mean(x)], [mean(info.convert(value) for value in y)])
@@ -126,7 +134,8 @@ def draw_summary(sweep: Sweep) -> Figure | None:
     """
     found = group_jobs(sweep)
     once = len(found) == len(sweep.jobs)
-    infos = [find_metric(key) for key in dict.fromkeys((*list_judging(sweep.jobs), *SUMMED))]
+    auc = find_auc(sweep.jobs)
+    infos = [find_metric(key) for key in (*([auc] if auc else []), *SUMMED)]
     charts = {axis: chart_over(axis, sweep, found, infos) for axis in sweep.shown}
     charts = {axis: row for axis, row in charts.items() if row}
     rows = [[replace(panel, joined=not once) for panel in row] for row in charts.values()]

@@ -24,9 +24,11 @@ from posefilter.report.settings import Change
 from posefilter.report.sweep_charts import chart_against_time, chart_over, name_axis, spell
 from posefilter.report.sweeps import (
     COLUMNS,
+    DETECTING,
     Group,
     Job,
     Sweep,
+    are_detectors,
     find_best_group,
     find_best_job,
     find_median,
@@ -94,15 +96,15 @@ def name_best(sweep: Sweep, winner: Job) -> list[Cell]:
     """Return which setting is the best: by the mean over its seeds where it has several, else by
     its run.
     """
-    found = group_jobs(sweep)
+    found, as_detectors = group_jobs(sweep), are_detectors(sweep.jobs)
     group = found[find_best_group(found)]
     if sweep.shown and len(group.jobs) > 1:
-        infos = map(find_metric, list_judging(group.jobs))
+        infos = map(find_metric, DETECTING if as_detectors else list_judging(group.jobs))
         figures = [f"{info.label} {format_mean(group, info)}" for info in infos]
         why = f"({', '.join([*figures, f'mean of {len(group.jobs)} seeds'])})"
         return [Text(spell(group.place), "code"), Text(why, "soft")]
     tied = find_ties(sweep)
-    median = find_median(winner)
+    median = None if as_detectors else find_median(winner)
     why = f"has the least {find_metric(median[0]).label}" if median else "is the first of them"
     ties = f"({tied} runs have its score to one decimal; it {why})"
     name = Text(spell(winner.place) or winner.folder, "code")
@@ -110,13 +112,18 @@ def name_best(sweep: Sweep, winner: Job) -> list[Cell]:
 
 
 def list_notes(sweep: Sweep, best: Run | None) -> list[str]:
-    """Return what a reader should know first: which runs have no result and why, and whether
-    the runs themselves are there.
+    """Return what a reader should know first: which runs have no result and why, by what the best
+    was found where the runs are of several kinds, and whether they themselves are there.
     """
     causes = {job.folder: job.error for job in sweep.failed}
     open_ended = [folder for folder in sweep.unfinished if folder not in causes]
     notes = [f"Without a result: {', '.join(open_ended)}."] if open_ended else []
     notes += [f"Failed: {folder}: {cause}" for folder, cause in causes.items()]
+    if are_detectors(sweep.jobs):
+        notes.append(
+            "Some runs predict no pose, and their score does not compare with an ADD AUC: the best "
+            "of all is by the mean of the particles on the object and the box's IoU."
+        )
     if not best:
         notes.append("The runs themselves are not there: numbers are those of summary.csv.")
     return notes

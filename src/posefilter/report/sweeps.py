@@ -27,6 +27,7 @@ COLUMNS = {  # of summary.csv, and the metrics that they hold
         "add_up_to_symmetry/median_mm", "iou", "particles_on_object", "seconds_per_image",
     )
 }  # fmt: skip
+DETECTING = ("iou", "particles_on_object")  # what the score of a detector is made of
 Value = int | float | str
 
 
@@ -197,13 +198,28 @@ def group_jobs(sweep: Sweep) -> list[Group]:
     return list(out.values())
 
 
+def find_auc(jobs: Sequence[Job]) -> str | None:
+    """Return the metric that poses are scored by; None where no run has any."""
+    kinds = {find_error(job.numbers) for job in jobs if "add/auc" in job.numbers}
+    # plain ADD where a sweep is of several objects, and one has no symmetries
+    return f"{min(kinds)}/auc" if kinds else None
+
+
+def are_detectors(jobs: Sequence[Job]) -> bool:
+    """Tell whether a sweep's runs are ranked as detectors though some predict poses: the others do
+    not, and an ADD AUC does not compare with their score.
+    """
+    posed = {"add/auc" in job.numbers for job in jobs}
+    return len(posed) == 2 and all(job.numbers.keys() >= {*DETECTING} for job in jobs)
+
+
 def list_judging(jobs: Sequence[Job]) -> list[str]:
     """Return the metrics that the score of runs is made of: one of poses, or two of detectors."""
     known = {key for job in jobs for key in job.numbers}
-    kinds = {find_error(job.numbers) for job in jobs if "add/auc" in job.numbers}
-    if kinds:  # plain ADD where a sweep is of several objects, and one has no symmetries
-        return [f"{min(kinds)}/auc"]
-    return [key for key in ("iou", "particles_on_object") if key in known]
+    auc = find_auc(jobs)
+    if auc and not are_detectors(jobs):
+        return [auc]
+    return [key for key in DETECTING if key in known]
 
 
 def find_median(job: Job) -> tuple[str, float] | None:
@@ -216,10 +232,14 @@ def find_median(job: Job) -> tuple[str, float] | None:
     return None
 
 
-def rank(jobs: Sequence[Job]) -> tuple[float, float]:
+def rank(jobs: Sequence[Job], as_detectors: bool) -> tuple[float, float]:
     """Return what the best of all has most of: the mean score to one decimal, then (where it ties)
     the least median error, up to symmetry where it is known.
+
+    as_detectors: Whether their poses do not count (see `are_detectors`).
     """
+    if as_detectors:
+        jobs = [job._replace(numbers={key: job.numbers[key] for key in DETECTING}) for job in jobs]
     medians = [median[1] if (median := find_median(job)) else math.inf for job in jobs]
     return round(mean(score_numbers(job.numbers, -math.inf) for job in jobs), 1), -mean(medians)
 
@@ -232,19 +252,21 @@ def find_best_job(sweep: Sweep) -> Job:
     """
     if not sweep.jobs:
         raise UserError(f"sweep={sweep.folder}: all of its {len(sweep.failed)} runs failed")
-    found = group_jobs(sweep)
-    return max(found[find_best_group(found)].jobs, key=lambda job: rank([job]))
+    found, as_detectors = group_jobs(sweep), are_detectors(sweep.jobs)
+    return max(found[find_best_group(found)].jobs, key=lambda job: rank([job], as_detectors))
 
 
 def find_ties(sweep: Sweep) -> int:
     """Return how many runs have the best run's score to one decimal."""
-    best = rank([find_best_job(sweep)])[0]
-    return sum(rank([job])[0] == best for job in sweep.jobs)
+    as_detectors = are_detectors(sweep.jobs)
+    best = rank([find_best_job(sweep)], as_detectors)[0]
+    return sum(rank([job], as_detectors)[0] == best for job in sweep.jobs)
 
 
 def find_best_group(found: Sequence[Group]) -> int:
     """Return which group has the highest mean score; of those that tie, the one with the least
     median error.
     """
-    ranks = [rank(group.jobs) for group in found]
+    as_detectors = are_detectors([job for group in found for job in group.jobs])
+    ranks = [rank(group.jobs, as_detectors) for group in found]
     return ranks.index(max(ranks))
