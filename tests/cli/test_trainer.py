@@ -82,8 +82,8 @@ def test_a_test_in_several_processes_is_refused_before_any_other_is_started(
     """Lightning ends all by SIGKILL once the second is refused as one too many."""
     words = [typed, "checkpoint=none.ckpt", f"out={tmp_path / 'x'}"]
     assert run_command("evaluate", HOME, words) == 2
-    told = f"{typed.removeprefix('+')}: evaluate tests in one process; leave it at 1"
-    assert capfd.readouterr().err == f"evaluate: {told}\n"
+    message = f"{typed.removeprefix('+')}: evaluate tests in one process; leave it at 1"
+    assert capfd.readouterr().err == f"evaluate: {message}\n"
 
 
 def test_a_test_on_all_devices_is_refused_where_there_are_several(

@@ -208,9 +208,9 @@ def test_a_scene_has_its_name_from_within_its_folder(root, typed, monkeypatch):
     assert [(r.name, r.scene_id) for r in records] == [("0048/000001", 48), ("0048/000002", 48)]
 
 
-def test_an_object_that_no_image_shows_is_told_as_such(root):
+def test_an_object_that_no_image_shows_is_named(root):
     """The folder is right, and has frames of others."""
     data = PoseDataModule("ycb_video", root, "037_scissors", progress=False)
-    with pytest.raises(UserError) as told:
+    with pytest.raises(UserError) as caught:
         data.setup("test")
-    assert str(told.value) == f"data.object=037_scissors: no frame in {root} (data.root) shows it"
+    assert str(caught.value) == f"data.object=037_scissors: no frame in {root} (data.root) shows it"

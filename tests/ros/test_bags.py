@@ -540,7 +540,7 @@ def write_marked(path: Path, order: list[tuple[str, int, int]]) -> Path:
 
 
 def test_depth_may_be_recorded_seconds_after_its_color(tmp_path: Path) -> None:
-    """As by a node that aligns it and lags; what comes later than that is counted, and told."""
+    """As by a node that aligns it and lags; what comes later is counted, and the reason says so."""
     times = [33 * number for number in range(1, 101)]
     order = [(kind, t, t + 2000 * (kind == "d")) for t in times for kind in "cd"]
     with BagReader(write_marked(tmp_path / "in", order), TOPICS, 0.01) as reader:

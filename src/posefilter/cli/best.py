@@ -12,7 +12,13 @@ from lightning.pytorch.callbacks import Checkpoint, ModelCheckpoint
 from torch import Tensor
 
 from posefilter.cli.resume import BEFORE, LAST
-from posefilter.cli.stopping import any_process, asked_to_stop, is_accumulating, is_over
+from posefilter.cli.stopping import (
+    any_process,
+    asked_to_stop,
+    is_accumulating,
+    is_over,
+    is_validated,
+)
 from posefilter.errors import UserError
 from posefilter.metrics.registry import HIGHER, LOWER, find_metric
 
@@ -101,9 +107,7 @@ class Last(Checkpoint):
 
     def on_train_batch_end(self, trainer: Trainer, pl_module: LightningModule, *_: Any) -> None:
         """Write it where it is time, unless a validation follows: that looks at the time, too."""
-        loop = trainer.fit_loop
-        assert loop._data_fetcher is not None
-        if self._due(trainer) and not loop.epoch_loop._should_check_val_fx(loop._data_fetcher):
+        if self._due(trainer) and not is_validated(trainer):
             self._save(trainer)
 
     def on_validation_end(self, trainer: Trainer, pl_module: LightningModule) -> None:

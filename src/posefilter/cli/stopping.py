@@ -24,9 +24,7 @@ class FinalValidation(Callback):
         """Do no more where a run goes on from the validation after its last batch: Lightning, which
         had none planned there, would begin another.
         """
-        loop = trainer.fit_loop
-        assert loop._data_fetcher is not None
-        if is_over(trainer) and not loop.epoch_loop._should_check_val_fx(loop._data_fetcher):
+        if is_over(trainer) and not is_validated(trainer):
             _stop(trainer)
 
     def on_train_batch_end(self, trainer: Trainer, *_: Any) -> None:
@@ -114,6 +112,13 @@ def is_over(trainer: Trainer) -> bool:
     by_steps = 0 < trainer.max_steps <= trainer.global_step
     epochs = trainer.max_epochs or -1
     return by_steps or (trainer.is_last_batch and 0 < epochs <= trainer.current_epoch + 1)
+
+
+def is_validated(trainer: Trainer) -> bool:
+    """Tell whether a validation follows the batch that a training is at."""
+    loop = trainer.fit_loop
+    assert loop._data_fetcher is not None
+    return loop.epoch_loop._should_check_val_fx(loop._data_fetcher)
 
 
 def is_accumulating(trainer: Trainer) -> bool:

@@ -231,11 +231,14 @@ class BagReader:
         limit = f"max_time_difference={self.tolerance / 1e9:g} s"
         if self.early:
             return f"camera_info={self.topics.camera_info}: its first message is after all images"
-        near = f"no color image has depth within {limit} that was recorded within "
-        near += f"{_WAITING / 1e9:g} s of it"
+        none, soon = (
+            f"no color image has depth within {limit}",
+            f"within {_WAITING / 1e9:g} s of it",
+        )
         if self._nearest is not None:
-            return f"{near}; the nearest is {self._nearest / 1e9:.4g} s away"
-        return f"{near}, after a first camera_info"
+            away = f"{self._nearest / 1e9:.4g} s away"
+            return f"{none}; the nearest is {away}, of what was recorded {soon}"
+        return f"{none} that was recorded {soon}, after a first camera_info"
 
     def _warn(self, sentence: str) -> None:
         if sentence not in self.warnings:
