@@ -161,11 +161,15 @@ class Result:
         check_pose_tolerance(pose_tolerance)
         if pose_tolerance in (None, RIGHT) and self.probability is not None:
             return self.probability
+        return float(self._assess(pose_tolerance or RIGHT).probability)
+
+    def _assess(self, pose_tolerance: PoseTolerance) -> Assessment:
+        """Return what the calibration makes of the features."""
         if self.calibration is None or not self.features:
             why = self.calibration_note or "the image cannot be judged"
             raise UserError(f"{self.object}: has no probability ({why})")
         row = {name: torch.tensor([value]) for name, value in self.features.items()}
-        return float(self.calibration.assess(row, pose_tolerance or RIGHT).probability)
+        return self.calibration.assess(row, pose_tolerance)
 
     @property
     def model(self) -> ObjectModel:

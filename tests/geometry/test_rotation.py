@@ -50,6 +50,20 @@ def test_conversions_are_scipys_and_romas() -> None:
     )
 
 
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_half_a_turn_has_a_finite_gradient(dtype: torch.dtype) -> None:
+    turned = torch.diag(torch.tensor([-1.0, -1.0, 1.0], dtype=dtype)).requires_grad_()
+    angle = angle_between(turned, torch.eye(3, dtype=dtype))
+    angle.backward()
+    assert float(angle.detach()) == pytest.approx(math.pi, abs=1e-7)
+    assert turned.grad is not None
+    assert bool(turned.grad.isfinite().all())
+    near = exp_so3(torch.tensor([math.pi - 0.01, 0, 0], dtype=dtype))
+    assert float(angle_between(near, torch.eye(3, dtype=dtype))) == pytest.approx(
+        math.pi - 0.01, abs=1e-4
+    )
+
+
 def test_a_wrong_quaternion_order_would_be_seen() -> None:
     quat = torch.from_numpy(Rotation.from_rotvec(V.numpy()).as_quat())
     assert (matrix_from_quat_xyzw(quat.roll(1, -1)) - exp_so3(V)).abs().max() > 0.5

@@ -65,12 +65,23 @@ def test_occluded_frames_raise_the_limit_where_they_are_enough_for_the_level() -
     found = Conformal((), (own,), "probability", (occluded,))
     assert found.find_limit(0.5, 0.3) == 14  # ceil(0.5 x 6), above 10
     assert found.find_limit(0.8, 0.3) == 16  # as the group's own
-    assert found.find_limit(0.9, 0.3) == 18  # the sixth of five: the group's own limit alone
+    assert found.find_limit(0.9, 0.3) == 18  # the sixth of five: the group's own limit is larger
     assert replace(found, occluded=(occluded[1:],)).find_limit(0.5, 0.3) == 10  # four are too few
     rare = replace(found, scores=(own + (20.0,) * 7,))
     assert rare.find_limit(0.5, 0.3) == 14  # five of 26 are less than a fifth: the 14th of 26
     easy = (-9.0, -8.0, -7.0, -6.0, -5.0)
     assert replace(found, occluded=(easy,)).find_limit(0.5, 0.3) == 10  # never a smaller set
+
+
+def test_a_set_of_a_higher_level_holds_those_of_lower_ones() -> None:
+    own = tuple(float(x) for x in range(40))
+    occluded = tuple(float(x) for x in range(27, 41))
+    found = Conformal((), (own,), "probability", (occluded,))
+    levels = [x / 100 for x in range(5, 98)]
+    limits = [found.find_limit(level, 0.3) for level in levels]
+    assert limits == sorted(limits)
+    assert limits[levels.index(0.95)] == 40  # 14 are too few for 95 %: the largest of them
+    assert found.find_limit(0.98, 0.3) == float("inf")  # so are all 40 here
 
 
 def test_frames_of_unknown_visibility_are_not_occluded() -> None:

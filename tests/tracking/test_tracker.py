@@ -19,6 +19,8 @@ from posefilter.confidence.calibration import (
     tabulate_errors,
 )
 from posefilter.confidence.conformal import Conformal
+from posefilter.confidence.fit import Frames, fit_calibration
+from posefilter.confidence.tolerance import RIGHT, PoseErrors, PoseTolerance
 from posefilter.errors import UserError
 from posefilter.estimator import Estimator
 from posefilter.filters.icp import PointToPlaneIcp
@@ -293,6 +295,27 @@ def test_a_track_has_no_conformal_sets() -> None:
         result = tracker.update(RGB, DEPTH, K)
         with pytest.raises(UserError, match=r"no conformal sets .* not of a track"):
             result.conformal_set(0.9)
+
+
+def test_a_probability_of_another_tolerance_is_lowered_as_the_presence_was() -> None:
+    rng = np.random.default_rng(0)
+    there = rng.random(400) < 0.5
+    values = np.where(there, -3.0, -9.0)[:, None] + rng.normal(size=(400, 1))
+    off = [np.where(there, size * rng.random(400), np.nan) for size in (0.02, 1.0, 0.12, 0.1)]
+    errors = PoseErrors(*off)
+    toy, estimator = make_toy()
+    toy.calibration = fit_calibration(
+        Frames(("score",), values, there, RIGHT.accepts(errors), errors=errors), "toy"
+    )
+    toy.truth = walk_pose(1)[0]
+    result = posefilter.Tracker(estimator).update(RGB, DEPTH, K)
+    tolerance = PoseTolerance(translation_mm=10)
+    single = posefilter.Result.probability_within(result, tolerance)
+    assert result.presence is not None
+    assert 0 < single < 0.9 * result.presence
+    assert result.probability_within(tolerance) == pytest.approx(single)
+    doubted = dataclasses.replace(result, presence=result.presence / 2)
+    assert doubted.probability_within(tolerance) == pytest.approx(single / 2)
 
 
 def test_why_a_lost_object_has_no_probability_is_told() -> None:

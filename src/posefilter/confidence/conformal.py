@@ -80,16 +80,15 @@ class Conformal:
             value: Of the frame: its probability, or its feature `surface`; see `by`.
 
         Returns:
-            The limit [nat]; infinite where the group's frames are too few for the level. Its
-            occluded frames count where they are enough for the level.
+            The limit [nat], which never falls as the level rises; infinite where the group's frames
+            are too few for the level. Where its occluded frames are, the largest of them counts.
         """
         group = self.find_group(value)
         own, occluded = self.scores[group], self.occluded[group] if self.occluded else ()
         limit = _find_quantile(own, level)
         if len(occluded) < max(_FEWEST_OCCLUDED, _LEAST_OCCLUDED * len(own)):
             return limit
-        second = _find_quantile(occluded, level)
-        return limit if math.isinf(second) else max(limit, second)
+        return max(limit, min(_find_quantile(occluded, level), occluded[-1]))
 
 
 def _find_quantile(scores: Sequence[float], level: float) -> float:

@@ -27,6 +27,7 @@ from posefilter.capabilities import Capabilities
 from posefilter.errors import UserError
 from posefilter.filters.resample import normalize_log_weights
 from posefilter.geometry.pose import origin_of, rotation_of
+from posefilter.geometry.rotation import angle_of_chord
 from posefilter.geometry.spaces import PartsSpace
 from posefilter.protocols import Resample, Space
 from posefilter.types import Particles, Resampled
@@ -56,7 +57,7 @@ def log_kernel(
     chord = torch.cdist(
         rotation_of(receiver).flatten(2), rotation_of(sender).flatten(2), compute_mode=exact
     )
-    angle = 2 * torch.asin((chord / math.sqrt(8)).clamp(max=1.0))
+    angle = angle_of_chord(chord)
     return -0.5 * ((distance / shift).square() + (angle / turn).square())
 
 

@@ -94,7 +94,8 @@ class Soft:
 
     With proposal q = alpha w + (1 - alpha) / M, children have the importance weights w / q, which
     carry gradients to their ancestors' weights. Here q is detached. At alpha = 1 the gradient of a
-    weighted mean is then unbiased (Scibior and Wood 2021); otherwise it need not be.
+    weighted mean is then unbiased (Scibior and Wood 2021) but for the normalization of the weights,
+    whose bias falls as 1 / M; otherwise it need not be.
 
     Args:
         alpha: Share of the weights in the mixture; 1 is unbiased resampling, 0 ignores the weights.

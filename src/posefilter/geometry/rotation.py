@@ -129,8 +129,19 @@ def angle_between(a: Tensor, b: Tensor) -> Tensor:
     Computed from the chord |a - b|_F = 2 sqrt(2) sin(angle / 2), which is accurate at small angles
     where the arc cosine of the trace is not.
     """
-    chord = torch.linalg.matrix_norm(a - b)
-    return 2 * torch.asin((chord / (2 * math.sqrt(2))).clamp(max=1.0))
+    return angle_of_chord(torch.linalg.matrix_norm(a - b))
+
+
+def angle_of_chord(chord: Tensor) -> Tensor:
+    """Return the angle [rad] between rotations by the Frobenius norm of their difference, (*).
+
+    What rounds to half a turn, a thousandth of a radian from it in float32, is half a turn, with a
+    gradient of zero in place of an infinite one.
+    """
+    sine = chord / (2 * math.sqrt(2))
+    limit = 1 - torch.finfo(sine.dtype).eps
+    angle = 2 * torch.asin(sine.clamp(max=limit))
+    return torch.where(sine < limit, angle, angle.new_tensor(math.pi))
 
 
 class _Procrustes(torch.autograd.Function):

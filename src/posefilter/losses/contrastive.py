@@ -36,8 +36,11 @@ def pose_distance(
 class Contrastive:
     """KL(target || softmax(score)) over an image's candidates; target ~ exp(-ADD^2 / (2 sigma^2)).
 
-    At its minimum exp(score) is proportional to the posterior smoothed by sigma, the noise level of
-    the scores. The loss is zero for images in which the object is not visible.
+    At its minimum exp(score) is proportional to p / q: p is the posterior smoothed by sigma, the
+    noise level of the scores, and q the density of the candidates, as in noise-contrastive
+    estimation (Gutmann and Hyvarinen 2010). Where q peaks at the modes of p, as the candidates of
+    `pose_pf` do, the score is flatter than log p. The loss is zero for images in which the object
+    is not visible.
     """
 
     requires: ClassVar[Capabilities] = ("candidates",)

@@ -13,7 +13,7 @@ from torch import Tensor
 from posefilter.confidence.apparent_size import ApparentSize
 from posefilter.confidence.calibration import Assessment
 from posefilter.confidence.features import measure_hidden
-from posefilter.confidence.tolerance import PoseTolerance
+from posefilter.confidence.tolerance import RIGHT, PoseTolerance
 from posefilter.confidence.verdicts import Costs, Verdict
 from posefilter.data.resize import network_size
 from posefilter.filters.icp import PointToPlaneIcp
@@ -90,11 +90,12 @@ class TrackResult(Result):
         return verdict if self.is_tracked or verdict != "found" else "unsure"
 
     def probability_within(self, pose_tolerance: PoseTolerance | None) -> float:
-        """Return the probability as of `Result`, at most the presence, which may have been lowered
-        since.
-        """
+        """Return the probability as of `Result`, lowered as the presence was."""
         within = super().probability_within(pose_tolerance)
-        return within if self.presence is None else min(within, self.presence)
+        if self.presence is None or pose_tolerance in (None, RIGHT):
+            return within
+        before = float(self._assess(RIGHT).presence)
+        return within * min(1.0, self.presence / before) if before else 0.0
 
     @property
     def shown_pose(self) -> np.ndarray | None:
