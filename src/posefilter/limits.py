@@ -119,7 +119,8 @@ def read_json(
 
 
 def read_yaml(path: Path, most: int) -> Any:
-    """Read a YAML file of plain data without aliases.
+    """Read a YAML file of plain data without aliases: one document, which empty ones may follow,
+    as `ros2 topic echo` ends each message with `---`.
 
     Args:
         path: The file.
@@ -130,7 +131,11 @@ def read_yaml(path: Path, most: int) -> Any:
     """
     try:
         # a SafeLoader, which makes nothing but plain data
-        return yaml.load(read_bytes(path, most).decode(), Loader=PlainLoader)
+        documents = yaml.load_all(read_bytes(path, most).decode(), Loader=PlainLoader)
+        first = next(documents, None)
+        if any(other is not None for other in documents):
+            raise yaml.YAMLError("it has several documents: keep one of them")
+        return first
     # YAML, UTF-8, whole numbers too long to read, days that there are not
     except (yaml.YAMLError, ValueError, RecursionError) as error:
         raise BadData(path, "is no YAML", find_reason(error)) from error
