@@ -120,7 +120,7 @@ def read_json(
 
 def read_yaml(path: Path, most: int) -> Any:
     """Read a YAML file of plain data without aliases: one document, which empty ones may follow,
-    as `ros2 topic echo` ends each message with `---`.
+    as `ros2 topic echo` ends each message with `---`; also one of OpenCV's FileStorage.
 
     Args:
         path: The file.
@@ -131,7 +131,8 @@ def read_yaml(path: Path, most: int) -> Any:
     """
     try:
         # a SafeLoader, which makes nothing but plain data
-        documents = yaml.load_all(read_bytes(path, most).decode(), Loader=PlainLoader)
+        text = read_bytes(path, most).decode().removeprefix("%YAML:1.0")  # no directive of YAML's
+        documents = yaml.load_all(text, Loader=PlainLoader)
         first = next(documents, None)
         if any(other is not None for other in documents):
             raise yaml.YAMLError("it has several documents: keep one of them")
@@ -149,6 +150,10 @@ class PlainLoader(yaml.SafeLoader):
         if self.check_event(yaml.AliasEvent):
             raise yaml.YAMLError("it has an alias (*name), which settings do not need")
         return super().compose_node(parent, index)
+
+
+# OpenCV's, as its JSON has it: rows, cols, dt, data
+PlainLoader.add_constructor("tag:yaml.org,2002:opencv-matrix", PlainLoader.construct_yaml_map)
 
 
 def check_picture(path: Path, data: bytes) -> int:

@@ -4,6 +4,7 @@ import json
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 
@@ -122,6 +123,22 @@ def test_cameras_that_differ_from_image_to_image_are_told(tmp_path: Path) -> Non
     (tmp_path / "scene_camera.json").write_text(json.dumps(content))
     with pytest.raises(BadData, match="has another camera for each image"):
         read_camera_file(tmp_path / "scene_camera.json")
+
+
+@pytest.mark.parametrize("name", ["camera.yaml", "old.yml", "camera.json"])
+def test_what_opencv_writes_is_read(name: str, tmp_path: Path) -> None:
+    path = tmp_path / name
+    storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_WRITE)
+    storage.write("image_width", 640)
+    storage.write("image_height", 480)
+    storage.write("camera_matrix", K)
+    storage.write("distortion_coefficients", np.array([[0.1, -0.2, 0, 0, 1e-7]]))
+    storage.release()
+    if path.stem == "old":
+        path.write_text("%YAML:1.0\n" + path.read_text().split("\n", 1)[1])
+    camera = read_camera_file(path)
+    np.testing.assert_array_equal(camera.K, K)
+    assert (camera.size, camera.distortion) == (SIZE, (0.1, -0.2, 0, 0, 1e-7))
 
 
 def test_a_distortion_is_not_passed_over(tmp_path: Path) -> None:

@@ -330,8 +330,13 @@ BOMB = "a: &a [x, x]\n" + "".join(
 @pytest.mark.parametrize(
     ("text", "told"),
     [(BOMB, "alias"), ("a: &a [*a]", "alias"), ("a: !!python/name:os.system", "is no YAML"),
-     ("a" * (1 << 21), "too large"), ("[" * 5_000, "is no YAML")],
-    ids=["alias bomb", "loop", "function", "large", "deep"],
+     ("a" * (1 << 21), "too large"), ("[" * 5_000, "is no YAML"),
+     ("a: !!opencv-matrix [1]", "is no YAML"), ("a: !!opencv-matrix {" * 5_000, "is no YAML"),
+     ("a: !!opencv-matrix {data: !!python/name:os.system }", "is no YAML"),
+     ("%YAML:1.0\n---\na: &a !!opencv-matrix {data: *a}", "alias"),
+     ("a: 1\n---\n" + BOMB, "alias")],
+    ids=["alias bomb", "loop", "function", "large", "deep", "matrix of a list", "deep matrix",
+         "matrix of a function", "matrix in a loop", "bomb in a second document"],
 )  # fmt: skip
 def test_a_runs_settings_are_plain(text: str, told: str, tmp_path: Path, watch: Any) -> None:
     (tmp_path / ".hydra").mkdir()

@@ -39,8 +39,8 @@ def read_camera_file(path: Path) -> CameraFile:
     """Read JSON, YAML, or a text or `.npy` of a matrix (3, 3) or of fx, fy, cx, cy.
 
     Known are fx, fy, cx, cy by name (BOP's `camera.json`, RealSense with ppx, ppy), a matrix of
-    nine numbers, by rows or by columns (Open3D), ROS's camera_info and its calibration files, and
-    BOP's `scene_camera.json` where all images have one camera.
+    nine numbers, by rows or by columns (Open3D), ROS's camera_info and its calibration files,
+    OpenCV's FileStorage, and BOP's `scene_camera.json` where all images have one camera.
 
     Raises:
         BadData: The file is missing, of none of these forms, or no camera's.
