@@ -81,7 +81,7 @@ def test_a_camera_is_read_of_any_form(
         ("a.json", json.dumps(FOUR | {"width": 1.5, "height": 1}), "should be a whole number"),
         ("a.yaml", "a: [", "is no YAML"),
         ("a.yaml", "k: 1\n---\nk: 2\n", "is no YAML .it has several documents: keep one"),
-        ("a.txt", "1 2 3", "3 words"),
+        ("a.txt", "1 2 3", r"3 words; expected a matrix \(3, 3\), or fx, fy, cx, cy"),
         ("a.txt", "1 2 3 4 5 6 7 8 9", "no camera matrix"),
     ],
 )
@@ -228,3 +228,7 @@ def test_a_matrix_that_numpy_saved_is_read(tmp_path: Path) -> None:
     np.save(file, np.eye(4))
     with pytest.raises(BadData, match=r"K\.npy: holds no camera \(16 words; expected a matrix"):
         read_camera_file(file)
+    text = tmp_path / "K.txt"
+    for values, delimiter in ((K, " "), (K, ","), ([*FOUR.values()], " ")):
+        np.savetxt(text, values, delimiter=delimiter, header="camera 1\nfx, 2020", footer="end")
+        np.testing.assert_allclose(read_camera_file(text).K, K)

@@ -36,7 +36,8 @@ class CameraFile(NamedTuple):
 
 
 def read_camera_file(path: Path) -> CameraFile:
-    """Read JSON, YAML, or a text or `.npy` of a matrix (3, 3) or of fx, fy, cx, cy.
+    """Read JSON, YAML, or a text or `.npy` of a matrix (3, 3) or of fx, fy, cx, cy; of a text,
+    lines that begin with # are none of it.
 
     Known are fx, fy, cx, cy by name (BOP's `camera.json`, RealSense with ppx, ppy), a matrix of
     nine numbers, by rows or by columns (Open3D), ROS's camera_info and its calibration files,
@@ -54,14 +55,16 @@ def read_camera_file(path: Path) -> CameraFile:
     if ending == ".npy":
         words = read_array(path).ravel()
     else:
-        words = " ".join(read_lines(path)).translate(str.maketrans(",;[]()", "      ")).split()
+        lines = [line for line in read_lines(path) if not line.startswith("#")]
+        words = " ".join(lines).translate(str.maketrans(",;[]()", "      ")).split()
     found = {"numbers": words}
     if len(words) == 4:
         fx, fy, cx, cy = numbers(found, "numbers", path, (4,)).tolist()
         return CameraFile(_matrix(fx, fy, cx, cy, path))
     if len(words) == 9:
         return CameraFile(_orient(numbers(found, "numbers", path, (3, 3)), path))
-    raise BadData(path, "holds no camera", f"{len(words)} words; expected a matrix (3, 3)")
+    expected = "a matrix (3, 3), or fx, fy, cx, cy"
+    raise BadData(path, "holds no camera", f"{len(words)} words; expected {expected}")
 
 
 def _of_mapping(content: Any, path: Path) -> CameraFile:
