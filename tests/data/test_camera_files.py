@@ -117,6 +117,19 @@ def test_another_depth_scale_than_the_default_is_asked_for(
         check_depth_scale(camera, default, "intrinsics=camera.json")
 
 
+def test_depth_scales_that_differ_from_image_to_image_are_asked_for(tmp_path: Path) -> None:
+    """Also where the default is that of one of them."""
+    content = {str(i): {"cam_K": K.ravel().tolist(), "depth_scale": 10.0**-i} for i in range(2)}
+    (tmp_path / "scene_camera.json").write_text(json.dumps(content))
+    camera = read_camera_file(tmp_path / "scene_camera.json")
+    told = (
+        r"^intrinsics=scene_camera\.json: .* different depth scales \(0\.1, 1\); type depth_scale="
+    )
+    for default in (1000, 10000):
+        with pytest.raises(UserError, match=told):
+            check_depth_scale(camera, default, "intrinsics=scene_camera.json")
+
+
 def test_cameras_that_differ_from_image_to_image_are_told(tmp_path: Path) -> None:
     other = K + np.array([[1, 0, 0], [0, 0, 0], [0, 0, 0]])
     content = {"0": {"cam_K": K.ravel().tolist()}, "1": {"cam_K": other.ravel().tolist()}}

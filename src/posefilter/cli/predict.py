@@ -353,7 +353,7 @@ def read_inputs(job: Job) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     camera = read_intrinsics(cfg.intrinsics, cfg.distortion is not None)
     by_default = "depth_scale" not in map(key_of, job.overrides)
     # last, since it reads the file once more
-    if by_default and camera.depth_scale is not None and not holds_meters(Path(cfg.depth)):
+    if by_default and camera.depth_scales and not holds_meters(Path(cfg.depth)):
         check_depth_scale(camera, cfg.depth_scale, f"intrinsics={cfg.intrinsics}")
     K = camera.K
     if camera.size is not None:
@@ -364,18 +364,24 @@ def read_inputs(job: Job) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def check_depth_scale(camera: CameraFile, units: float, setting: str) -> None:
-    """Raise UserError where the camera's file has another depth scale than the default.
+    """Raise UserError where the camera's file has another depth scale than the default, or several.
 
     Args:
         camera: The camera.
         units: Units of the depth files in a meter, which nobody typed.
         setting: What names the file, as typed.
     """
-    own = camera.depth_scale
+    if not camera.depth_scales:
+        return
+    own, *others = camera.depth_scales
+    if others:  # which only BOP's files have
+        some = ", ".join(f"{one:g}" for one in camera.depth_scales[:6])
+        raise UserError(
+            f"{setting}: its images have different depth scales ({some}); type depth_scale=, 1000 "
+            "over that of this image"
+        )
     # of BOP millimeters a unit, of others units in a meter, or meters a unit
-    if own is None or any(
-        math.isclose(units, one, rel_tol=1e-3) for one in (1000 / own, own, 1 / own)
-    ):
+    if any(math.isclose(units, one, rel_tol=1e-3) for one in (1000 / own, own, 1 / own)):
         return
     raise UserError(
         f"{setting}: its depth_scale is {own:g}, which for BOP's files means depth_scale="

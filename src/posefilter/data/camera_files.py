@@ -32,7 +32,8 @@ class CameraFile(NamedTuple):
     distortion: tuple[float, ...] = ()  # of its lens, in OpenCV's order
     other_model: str = ""  # the distortion's kind, where that is not OpenCV's polynomial
     rectified: np.ndarray | None = None  # (3, 3) of its rectified images, where the file has one
-    depth_scale: float | None = None  # as the file has it, whose unit differs between formats
+    # as the file has them, whose unit differs between formats; several where images differ
+    depth_scales: tuple[float, ...] = ()
 
 
 def read_camera_file(path: Path) -> CameraFile:
@@ -85,9 +86,8 @@ def _of_mapping(content: Any, path: Path) -> CameraFile:
         cameras = np.stack([numbers(one, "cam_K", path, (3, 3)) for one in images])
         if np.ptp(cameras, axis=0).max() > 1e-6:
             raise BadData(path, "has another camera for each image", "type its numbers")
-        scales = {_find_scale(one, path) for one in images}
-        scale = scales.pop() if len(scales) == 1 else None
-        return CameraFile(_orient(cameras[0], path), depth_scale=scale)
+        scales = {scale for one in images for scale in _find_scale(one, path)}
+        return CameraFile(_orient(cameras[0], path), depth_scales=(*sorted(scales),))
     some = ", ".join(map(str, [*content][:6]))
     raise BadData(path, "holds no camera", f"expected fx, fy, cx, cy or a matrix; it has {some}")
 
@@ -110,15 +110,16 @@ def _of_camera(content: Mapping[str, Any], K: np.ndarray, path: Path) -> CameraF
     rectified = None if P is None or P[0, 0] <= 0 else P[:, :3]
     scale = _find_scale(content, path)
     if not any(coefficients):
-        return CameraFile(K, size, rectified=rectified, depth_scale=scale)
+        return CameraFile(K, size, rectified=rectified, depth_scales=scale)
     return CameraFile(K, size, coefficients, _find_other_model(content), rectified, scale)
 
 
-def _find_scale(content: Mapping[str, Any], path: Path) -> float | None:
+def _find_scale(content: Mapping[str, Any], path: Path) -> tuple[float, ...]:
+    """Return the depth scale of a mapping; () where it has none."""
     if content.get("depth_scale") is None:
-        return None
+        return ()
     scale = float(numbers(content, "depth_scale", path, ()))
-    return scale if scale > 0 else None
+    return (scale,) if scale > 0 else ()
 
 
 def _find_named(content: Mapping[str, Any], path: Path) -> tuple[float, ...]:
