@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from posefilter.cli.predict import check_depth_scale, read_intrinsics
-from posefilter.data.camera_files import read_camera_file
+from posefilter.data.camera_files import CameraFile, read_camera_file
 from posefilter.errors import BadData, UserError
 
 K = np.array([[1066.778, 0, 312.9869], [0, 1067.487, 241.3109], [0, 0, 1]])
@@ -115,6 +115,21 @@ def test_another_depth_scale_than_the_default_is_asked_for(
         return
     with pytest.raises(UserError, match=r"its depth_scale is 1, which .* depth_scale=1000 here"):
         check_depth_scale(camera, default, "intrinsics=camera.json")
+
+
+@pytest.mark.parametrize(
+    ("own", "told"),
+    [
+        (0.001, "which in meters a unit means depth_scale=1000 here, and"),
+        (0.01, "BOP's files. means depth_scale=100000 here, or in meters a unit means .*=100 here"),
+        (5000.0, "which in units in a meter means depth_scale=5000 here, and"),
+        (20.0, "is 20, and"),
+    ],
+)
+def test_no_reading_of_a_depth_scale_is_advised_that_no_camera_has(own: float, told: str) -> None:
+    """A RealSense's `get_depth_scale` is meters a unit, which as BOP's would be 1e+06."""
+    with pytest.raises(UserError, match=rf"{told}.* 10000 is the default; type depth_scale=$"):
+        check_depth_scale(CameraFile(K, depth_scales=(own,)), 10000, "intrinsics=camera.json")
 
 
 def test_depth_scales_that_differ_from_image_to_image_are_asked_for(tmp_path: Path) -> None:

@@ -68,6 +68,7 @@ _COVARIANCE = (
     "rotation vector about it in the object's own axes [rad]"
 )
 _ERROR_COVARIANCE = "of the pose's error, if the pose is right; axes and units as of covariance"
+_USUAL_UNITS = 100, 100_000  # of depth files, in a meter
 
 
 def predict(job: Job) -> None:
@@ -380,12 +381,22 @@ def check_depth_scale(camera: CameraFile, units: float, setting: str) -> None:
             f"{setting}: its images have different depth scales ({some}); type depth_scale=, 1000 "
             "over that of this image"
         )
-    # of BOP millimeters a unit, of others units in a meter, or meters a unit
-    if any(math.isclose(units, one, rel_tol=1e-3) for one in (1000 / own, own, 1 / own)):
+    readings = {
+        "millimeters a unit (BOP's files)": 1000 / own,
+        "meters a unit": 1 / own,
+        "units in a meter": own,
+    }
+    if any(math.isclose(units, one, rel_tol=1e-3) for one in readings.values()):
         return
+    low, high = _USUAL_UNITS
+    meant = ", or ".join(
+        f"in {unit} means depth_scale={one:g} here"
+        for unit, one in readings.items()
+        if low <= one <= high
+    )
+    which = f"which {meant}, and " if meant else "and "
     raise UserError(
-        f"{setting}: its depth_scale is {own:g}, which for BOP's files means depth_scale="
-        f"{1000 / own:g} here, and {units:g} is the default; type depth_scale="
+        f"{setting}: its depth_scale is {own:g}, {which}{units:g} is the default; type depth_scale="
     )
 
 
