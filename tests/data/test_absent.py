@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from tests.data.dataset_trees import bop_scene, pose, write_mesh
+from tests.data.dataset_trees import bop_scene, pose, write_mesh, ycb_frame
 
 from posefilter.data.absent import deal_images, find_absent, hide_annotation
 from posefilter.data.frames import FrameRecord
@@ -15,6 +15,7 @@ from posefilter.errors import UserError
 from posefilter.synthetic.generate import generate
 
 SIZE = (96, 72)
+CARTON = "003_cracker_box"
 
 
 @pytest.fixture(scope="module")
@@ -118,6 +119,42 @@ def test_an_image_that_is_annotated_as_empty_lacks_the_object(
     assert not batch.mask.any()
     assert batch.depth.max() > 0.5
     assert "annotates one class" not in caplog.text
+
+
+def test_images_without_the_object_that_cannot_be_read_are_told_or_counted(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    scene = tmp_path / "000001"
+    bop_scene(scene, [[(1, pose())], [], [(1, pose())], [], []])
+    (scene / "depth" / "000001.png").unlink()
+    (scene / "rgb" / "000003.png").write_bytes(b"")
+    how = {"split": {"test": 1.0}, "workers": 0, "progress": False}
+    data = PoseDataModule("bop", tmp_path, "obj_000001", **how)
+    with pytest.raises(UserError, match=r"00000[13]\.png: .* data\.on_error=skip"):
+        data.absent_dataset("test")
+    skipping = PoseDataModule("bop", tmp_path, "obj_000001", on_error="skip", **how)
+    assert [one.im_id for one in skipping.absent_dataset("test").records] == [4]
+    told = "left out of the frames without obj_000001: {}.png: {} (1 such)"
+    assert told.format(scene / "depth" / "000001", "missing file") in caplog.text
+    empty = "truncated or corrupt image (the file is empty)"
+    assert told.format(scene / "rgb" / "000003", empty) in caplog.text
+
+
+def test_masks_of_other_objects_are_not_needed(tmp_path: Path) -> None:
+    far = pose(position=(0, 0, 7.0))  # beyond what depth is kept, and hidden
+    bop_scene(tmp_path / "bop" / "000001", [[(1, pose())], [(2, pose())], [(2, far), (3, far)]])
+    for file in (tmp_path / "bop" / "000001" / "mask_visib").glob("00000[12]_*"):
+        file.unlink()
+    twice = [(3, pose()), (3, pose(position=(0.05, 0.05, 0.5)))]
+    for number, shown in enumerate([[(2, pose())], twice, twice]):
+        ycb_frame(tmp_path / "ycb" / "0001" / f"{number:06d}", shown, np.eye(4))
+    for source, name, root in (("bop", "obj_000001", "bop"), ("ycb_video", CARTON, "ycb")):
+        how = {"split": {"test": 1.0}, "workers": 0, "progress": False}
+        frames = PoseDataModule(source, tmp_path / root, name, **how).absent_dataset("test")
+        assert {one.im_id for one in frames.records} == {1, 2}
+        (batch,) = make_loader(frames, 2, 0)
+        assert not batch.mask.any()
+        assert batch.depth.max() > 0.5
 
 
 def test_an_image_counts_once_and_only_where_the_object_is_not_listed() -> None:

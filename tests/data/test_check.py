@@ -226,6 +226,21 @@ def test_broken_files_and_missing_meshes_are_reported(tmp_path, meshes):
         check_dataset(reader, meshes, limit=0)
 
 
+def test_images_that_show_nothing_are_read_too(tmp_path, meshes):
+    folder = tmp_path / "000001"
+    bop_scene(folder, [[(2, POSES[0])], [], [], []])
+    reader = BopReader(tmp_path, "obj_000002", meshes, on_error="skip")
+    assert check_dataset(reader, meshes)["problems"] == []
+    (folder / "rgb" / "000001.png").write_bytes(b"")
+    for number in (2, 3):
+        (folder / "depth" / f"{number:06d}.png").unlink()
+    report = check_dataset(BopReader(tmp_path, "obj_000002", meshes, on_error="skip"), meshes)
+    assert [row["object"] for row in report["objects"]] == ["obj_000002"]
+    image, depth = report["problems"]
+    assert re.search(r"000001\.png: truncated.* \(1 such of 3 frames looked at\)$", image)
+    assert re.search(r"000002\.png: missing file \(2 such of 3 frames looked at\)$", depth)
+
+
 def test_what_stands_in_front_where_depth_is_unknown_is_no_error_of_the_pose(tmp_path, meshes):
     """An occluder that is not labeled, and of which the sensor has no depth."""
     root = tree(tmp_path)

@@ -17,7 +17,7 @@ from rich.text import Text
 from posefilter.checking.compare import Fit, View, compare, half_pixel, likely_causes
 from posefilter.checking.contact_figure import tile, write_sheet
 from posefilter.checking.frames import Suspect, describe_suspects, is_suspect
-from posefilter.data.frames import Implausible, NotShown
+from posefilter.data.frames import FrameRecord, Implausible, NotShown
 from posefilter.data.readers.base import BaseReader
 from posefilter.data.readers.checked import index_records, read_checked
 from posefilter.data.silhouette import Geometry
@@ -43,12 +43,14 @@ def check_dataset(
     progress: bool = False,
     seed: int = 0,
 ) -> dict[str, Any]:
-    """Compare frames of each of a reader's objects with its mesh.
+    """Compare frames of each of a reader's objects with its mesh, and see whether images that are
+    annotated as showing none can be read.
 
     Args:
         reader: The dataset, opened with on_error="skip": broken files are reported, not raised.
         meshes: The meshes.
-        limit: Frames of each object at most, one of each of so many equal parts; None: all.
+        limit: Frames of each object at most, and of none, one of each of so many equal parts; None:
+            all.
         out: Gets data_report.json and contact_sheet.png.
         progress: Draw a bar.
         seed: Of the choice of frames.
@@ -65,12 +67,14 @@ def check_dataset(
     """
     if limit is not None and limit < 1:
         raise UserError(f"max_frames={limit}: compare at least one frame of each object")
+    reader.add_empty()
     index_records(reader, reader.records())
     geometry = Geometry(meshes)
     problems = [
         f"{reader.examples.get(cause, cause)} ({count} such)"
         for cause, count in reader.skipped.items()
     ]
+    problems += _check_empty(reader, limit, progress, seed)
     rows, tiles = [], []
     left_out = [
         name for name in reader.objects if name.startswith(LOOKALIKE) and not meshes.has(name)
@@ -115,6 +119,38 @@ def format_report(report: dict[str, Any]) -> str:
     return console.export_text() + note + found
 
 
+def _check_empty(reader: BaseReader, limit: int | None, progress: bool, seed: int) -> list[str]:
+    """Return which of the images that are annotated as showing no object cannot be read."""
+    records = reader.records()
+    chosen = _choose(records, "", limit, seed)
+    broken = []
+    for i in watched(chosen, len(chosen), "no object", progress):
+        try:
+            read_checked(reader, i, records[i])
+        except BadData as error:
+            broken.append((error.cause, str(error)))
+    return _count_broken(broken, len(chosen))
+
+
+def _choose(records: Sequence[FrameRecord], name: str, limit: int | None, seed: int) -> list[int]:
+    """Return the places of a class's records that are looked at."""
+    mine = [i for i, record in enumerate(records) if record.object == name]
+    count = min(limit or len(mine), len(mine))
+    # at random within equal parts: a fixed step may be a multiple of the dataset's own period
+    shifts = np.random.default_rng(seed).random(count)
+    places = (np.arange(count) + shifts) * len(mine) / max(count, 1)
+    return [mine[k] for k in places.astype(int)]
+
+
+def _count_broken(broken: Sequence[tuple[str, str]], looked_at: int) -> list[str]:
+    """Return a sentence for each cause of broken frames, given as causes and messages."""
+    first = dict(reversed(broken))
+    return [
+        f"{first[cause]} ({count} such of {looked_at} frames looked at)"
+        for cause, count in Counter(cause for cause, _ in broken).items()
+    ]
+
+
 def _check_object(
     reader: BaseReader,
     geometry: Geometry,
@@ -126,18 +162,12 @@ def _check_object(
 ) -> tuple[dict[str, Any], list[str], list[np.ndarray]]:
     """Return an object's row, its problems and its tiles."""
     records = reader.records()
-    mine = [i for i, record in enumerate(records) if record.object == name]
     mesh = geometry.mesh(name)
     if mesh is None:
         return _row(name, [], 0), [f"{name}: no mesh of this name in {geometry.meshes.root}"], []
     native = reader.native_from_mesh(name)
-    count = min(limit or len(mine), len(mine))
-    # at random within equal parts: a fixed step may be a multiple of the dataset's own period
-    shifts = np.random.default_rng(seed).random(count)
-    places = (np.arange(count) + shifts) * len(mine) / max(count, 1)
-    chosen = [mine[k] for k in places.astype(int)]
-    broken: Counter[str] = Counter()
-    examples: dict[str, str] = {}
+    chosen = _choose(records, name, limit, seed)
+    broken: list[tuple[str, str]] = []  # cause and message
     not_shown = 0
     views: list[View] = []
     fits: list[Fit] = []
@@ -155,8 +185,7 @@ def _check_object(
             not_shown += 1
             continue
         except BadData as error:
-            broken[error.cause] += 1
-            examples.setdefault(error.cause, str(error))
+            broken.append((error.cause, str(error)))
             continue
         fit = compare(view, geometry)
         fits.append(fit)
@@ -166,10 +195,7 @@ def _check_object(
             views.append(view)
         if len(tiles) < drawn:
             tiles.append(tile(view, fit, f"{records[i].name} {name}"))
-    problems = [
-        f"{examples[cause]} ({count} such of {len(chosen)} frames looked at)"
-        for cause, count in broken.items()
-    ]
+    problems = _count_broken(broken, len(chosen))
     row = _row(name, fits, not_shown)
     if not fits:
         return row, [*problems, f"{name}: no frame shows it"], tiles

@@ -29,6 +29,7 @@ from posefilter.cli.recipe import check_data
 from posefilter.cli.results import record, show, write_json
 from posefilter.confidence.tolerance import RIGHT, read_pose_tolerance
 from posefilter.data.absent import hide_annotation
+from posefilter.data.dataset import FrameDataset
 from posefilter.data.loaders import make_loader
 from posefilter.data.module import PoseDataModule
 from posefilter.errors import UserError
@@ -110,10 +111,13 @@ def _of_checkpoint(job: Job) -> tuple[dict[str, Any], dict[str, Path]]:
     if trainer.limit_test_batches == 0:
         raise UserError("trainer.limit_test_batches=0: leaves nothing to test")
     device = trainer.strategy.root_device
+    # broken files are refused before anything is tested
+    absent = open_absent(method, data, job.cfg.absent_frames, job.cfg.console)
     trainer.test(method, datamodule=data, verbose=False)
     method.to(device)  # which Lightning has left
     files = {"beliefs": job.folder / "beliefs.npz", "errors": job.folder / ERRORS}
-    judge_absent(method, data, job.cfg.absent_frames, job.cfg.console)
+    if absent is not None:
+        judge_absent(method, absent)
     native = data.reader.native_from_mesh
     if "pose" in method.capabilities:
         files["poses"] = job.folder / "poses.csv"
@@ -153,25 +157,32 @@ def warn_of_several(data: PoseDataModule, console: str) -> None:
         warn(console, sentence, several=several, images=len(counts))
 
 
-def judge_absent(method: PoseEstimator, data: PoseDataModule, limit: int, console: str) -> None:
-    """Add frames of the test's scenes that lack the object to the metrics of a calibrated method.
+def open_absent(
+    method: PoseEstimator, data: PoseDataModule, limit: int, console: str
+) -> FrameDataset | None:
+    """Return frames of the test's scenes that lack the object, None where none are wanted or there.
 
     Args:
-        method: It was tested on frames with the object.
+        method: Only a calibrated one is judged by them.
         data: The frames' dataset.
         limit: How many frames at most.
         console: "rich" or "json".
     """
     if method.calibration is None or limit == 0:
-        return
+        return None
     frames = data.absent_dataset("test", limit)
-    if not len(frames):
-        sentence = (
-            f"no frame of the test's scenes is known to lack {method.object_model.name}: false "
-            "alarms are not counted"
-        )
-        warn(console, sentence)
-        return
+    if len(frames):
+        return frames
+    sentence = (
+        f"no frame of the test's scenes is known to lack {method.object_model.name}: false "
+        "alarms are not counted"
+    )
+    warn(console, sentence)
+    return None
+
+
+def judge_absent(method: PoseEstimator, frames: FrameDataset) -> None:
+    """Add frames that lack the object to the metrics of a method that was tested on others."""
     with torch.no_grad():
         for number, batch in enumerate(make_loader(frames, frames.find_batch_size(_BATCH), 0)):
             hidden = Batch(*(x.to(method.device) for x in hide_annotation(batch)))

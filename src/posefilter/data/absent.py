@@ -2,6 +2,7 @@
 
 from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
+from dataclasses import replace
 from itertools import cycle
 
 import torch
@@ -17,7 +18,7 @@ def find_absent(
     name: str,
     unlisted: Collection[tuple[str, str]] = (),
 ) -> list[FrameRecord]:
-    """Return one record of each image in which an object is not listed.
+    """Return one record of each image in which an object is not listed, its class "".
 
     Args:
         records: Of all classes of a dataset.
@@ -31,7 +32,7 @@ def find_absent(
     found: dict[str, FrameRecord] = {}
     for record in records:
         if record.name not in showing:
-            found.setdefault(record.name, record)
+            found.setdefault(record.name, replace(record, object=""))
     return list(found.values())
 
 

@@ -46,6 +46,7 @@ class FrameDecoder:
     ) -> None:
         self._reader, self._size = reader, (width, height)
         self._threads, self._progress = threads, progress
+        self.examples: dict[str, str] = {}  # of each cause of bad frames, the first message
         self.cache = cache(self.read)
         self._index = index_records(reader, records)
 
@@ -93,6 +94,7 @@ class FrameDecoder:
                         f"{found}; data.on_error=skip leaves such frames out and counts them"
                     ) from found
                 left_out[found.cause] += 1
+                self.examples.setdefault(found.cause, str(found))
             elif found.pixels == 0 and record.object:
                 left_out["the mask vanishes at this image size"] += 1
             elif self._measure_distance(record, found) > FARTHEST:

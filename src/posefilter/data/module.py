@@ -294,14 +294,18 @@ class PoseDataModule(LightningDataModule):
 
     def absent_dataset(self, split: str, limit: int | None = None) -> FrameDataset:
         """Return images of a split in which the object is not, the first so many of a fixed
-        shuffle; masks and poses are those of other objects.
+        shuffle; masks are empty, but of a plug-in's reader may be those of other objects.
 
         An image counts where the dataset does not list the object in it, and where its scene is of
         no other split.
+
+        Raises:
+            UserError: A file is broken, and `on_error` is "raise".
         """
         name = self._object if isinstance(self._object, str) else self.objects[0]
-        reader = open_whole(self.source, self.root, [name], None, "skip", **self._options)
+        reader = open_whole(self.source, self.root, [name], None, self._on_error, **self._options)
         reader.add_empty()
+        reader.hide_objects()
         records = reader.records()
         try:
             own = self._records
@@ -324,7 +328,12 @@ class PoseDataModule(LightningDataModule):
         keep = partial(open_cache, "memory", Path(), "")
         decoder = self._make_decoder(reader, records, keep)
         title = "decoding frames without the object"
-        chosen, _ = decoder.find_usable([found[i] for i in order], 0.0, limit, "skip", title)
+        chosen, left_out = decoder.find_usable(
+            [found[i] for i in order], 0.0, limit, self._on_error, title
+        )
+        for reason, count in left_out.items():
+            example = decoder.examples.get(reason, reason)
+            log.warning("left out of the frames without %s: %s (%d such)", name, example, count)
         return FrameDataset(chosen, decoder.cache)
 
     def train_dataloader(self) -> DataLoader[Batch]:

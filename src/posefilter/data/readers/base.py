@@ -17,6 +17,8 @@ from posefilter.errors import BadData
 from posefilter.meshes.store import BUILTIN, MeshStore
 from posefilter.paths import check_inside
 
+# the pose of no object: a meter ahead of the camera, since a plausible one is asked for
+AHEAD = np.array([[1.0, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 1], [0, 0, 0, 1]])
 _PLACE = re.compile(r"(?<=')[0-9]+(\[[0-9]+\])?\.|\[[0-9]+\]")  # of a key, in its file
 
 
@@ -30,6 +32,7 @@ class BaseReader:
     objects: tuple[str, ...]  # that it was asked for, or all that it has
     _entries: Sequence[Any]
     _empty: Sequence[Any] = ()  # likewise, of images that are annotated as showing none
+    _shows_objects = True
 
     def __init__(self, root: str | Path, meshes: MeshStore | None, on_error: str) -> None:
         self.root, self.on_error = Path(root), on_error
@@ -49,7 +52,14 @@ class BaseReader:
     def add_empty(self) -> None:
         """Add a record of each image that is annotated as showing no object; its class is ""."""
         if self._empty:
-            self._entries = [*self._entries, *self._empty]
+            self._entries, self._empty = [*self._entries, *self._empty], ()
+
+    def hide_objects(self) -> None:
+        """Read every record as that of an image that shows no object: its mask is not needed.
+
+        A reader that is a plug-in's may go on reading masks and poses.
+        """
+        self._shows_objects = False
 
     def read(self, i: int) -> Sample:
         """Return record i at the dataset's resolution, its visibility still unknown.
@@ -134,11 +144,16 @@ class BaseReader:
         `check_sample` takes them.
         """
         entry, unknown = self._entries[i], float("nan")
-        # one without an object has no index, which nothing reads
-        object_id = self.objects.index(entry.record.object) if entry.record.object else 0
-        pose = entry.camera_from_object
+        if not self._is_shown(entry):  # nothing reads the index
+            sample = Sample(rgb, depth, mask, narrow(K), narrow(AHEAD), 0, i, unknown)
+            return check_sample(sample, AHEAD, files)
+        object_id, pose = self.objects.index(entry.record.object), entry.camera_from_object
         sample = Sample(rgb, depth, mask, narrow(K), narrow(pose), object_id, i, unknown)
         return check_sample(sample, pose @ np.linalg.inv(native_from_mesh), files)
+
+    def _is_shown(self, entry: Any) -> bool:
+        """Tell whether an entry is read as an object, not as an image that shows none."""
+        return bool(entry.record.object) and self._shows_objects
 
     def _own_part(self, entry: Any, K: np.ndarray, mask: np.ndarray) -> np.ndarray:
         """Return an instance's part of a class's mask, which others in the image (its `twins`) may

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 
 from posefilter.data.frames import FrameRecord, NotShown, Sample
-from posefilter.data.readers.base import BaseReader
+from posefilter.data.readers.base import AHEAD, BaseReader
 from posefilter.data.readers.decode import (
     count_pictures,
     expect_size,
@@ -40,8 +40,6 @@ _DEPTH_ENDINGS = ("png", "tif", "tiff", "PNG", "TIF", "TIFF")  # ITODD's images 
 _INFO = "models_info.json"
 _SAME_DIAMETER = 0.05  # share by which BOP's models of YCB-V may differ from YCB's own
 _IMAGE = _SCENE = re.compile(r"[0-9]{1,9}")
-# the pose of no object: a meter ahead of the camera, since a plausible one is asked for
-_AHEAD = np.array([[1.0, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 1], [0, 0, 0, 1]])
 
 
 @dataclass(frozen=True, eq=False)
@@ -190,7 +188,7 @@ class BopReader(BaseReader):
         entry = self._entries[i]
         color_path, depth_path, mask_path, gt_path, camera_path = self._files(entry.record)
         check_camera(entry.K, camera_path)
-        mask = self._read_mask(mask_path) if entry.record.object else None
+        mask = self._read_mask(mask_path) if self._is_shown(entry) else None
         rgb = read_color(color_path)
         depth = read_depth(depth_path, entry.units, scaled_floats=True)
         height, width = rgb.shape[:2]
@@ -291,7 +289,7 @@ class BopReader(BaseReader):
             record = FrameRecord(
                 f"{group}/{stem}", group, int(folder.name), int(image), 0, "", 0, files
             )
-            self._empty.append(_Entry(record, K, units, _AHEAD, ()))
+            self._empty.append(_Entry(record, K, units, AHEAD, ()))
         entries = []
         for k, one in enumerate(truth):
             where = f"{image}[{k}]."

@@ -152,6 +152,8 @@ class FatReader(BaseReader):
         return self._make_sample(i, rgb, depth, mask, camera.K, aligned, files)
 
     def _mask(self, entry: _Entry, seg: np.ndarray) -> np.ndarray:
+        if not self._is_shown(entry):
+            return np.zeros_like(seg, dtype=bool)
         mask = self._own_part(entry, entry.camera.K, seg == entry.kind.seg_id)
         if mask.any():
             return mask

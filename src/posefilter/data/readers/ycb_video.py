@@ -135,6 +135,8 @@ class YCBVideoReader(BaseReader):
         if int(label.max()) > len(self._classes):
             found = f"label {int(label.max())}, but there are {len(self._classes)} classes"
             raise BadData(path, "unknown class", found)
+        if not self._is_shown(entry):
+            return np.zeros_like(label, dtype=bool)
         mask = self._own_part(entry, entry.K, label == entry.label)
         if not label.any():
             raise BadData(path, "empty mask", "no object at all in the label image")
