@@ -115,6 +115,17 @@ def test_broken_json_is_named_or_counted(tmp_path, case):
     assert sum(reader.skipped.values()) == 1
 
 
+@pytest.mark.parametrize("name", ["obj_000002", "003_cracker_box"])
+def test_a_class_that_is_unknown_since_files_are_broken_is_no_mistake_of_the_name(tmp_path, name):
+    bop_scene(tmp_path / "000001", [[(2, pose())]])
+    (tmp_path / "000001" / "scene_camera.json").unlink()
+    with pytest.raises(UserError, match=r"^\S*scene_camera\.json: missing file; no image is left"):
+        BopReader(tmp_path, name, on_error="skip")
+    bop_scene(tmp_path / "000002", [[(5, pose())]])
+    with pytest.raises(UserError, match=r"obj_000005.*; left out: \S*scene_camera\.json: missing"):
+        BopReader(tmp_path, name, on_error="skip")
+
+
 def test_broken_masks_and_folders(tmp_path):
     bop_scene(tmp_path / "000001", [[(2, pose())]])
     reader = BopReader(tmp_path)

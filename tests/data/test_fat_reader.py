@@ -329,6 +329,14 @@ def test_a_transform_that_is_no_rotation_is_refused(tmp_path):
         FatReader(tmp_path)
 
 
+def test_a_class_is_unknown_since_its_folders_settings_are_broken(tmp_path):
+    one_frame(tmp_path)
+    (settings,) = tmp_path.glob("single/*/*/_object_settings.json")
+    settings.write_text("{")
+    with pytest.raises(UserError, match=r"^\S*_object_settings\.json: not readable.* is left"):
+        FatReader(tmp_path, "toy", on_error="skip")
+
+
 def test_unknown_object_and_folder(tmp_path):
     one_frame(tmp_path)
     with pytest.raises(UserError, match=r"unknown class 'tooy'.*did you mean 'toy'"):

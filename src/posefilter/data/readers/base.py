@@ -32,7 +32,7 @@ class BaseReader:
     objects: tuple[str, ...]  # that it was asked for, or all that it has
     _entries: Sequence[Any]
     _empty: Sequence[Any] = ()  # likewise, of images that are annotated as showing none
-    _shows_objects = True
+    _shows_objects = True  # or each record is read as an image that shows none
 
     def __init__(self, root: str | Path, meshes: MeshStore | None, on_error: str) -> None:
         self.root, self.on_error = Path(root), on_error

@@ -125,15 +125,17 @@ class BopReader(BaseReader):
             int(one["obj_id"]) for _, scene in scenes for gt in scene[0].values() for one in gt
         }
         known = sorted(map(self._name, numbers_seen))
+        broken = next(iter(self.examples.values()), "")
         try:
-            self.objects = choose_objects(wanted, known, base)
+            self.objects = choose_objects(wanted, known, base, broken=broken)
         except UserError as error:
-            if not self._by_ycb_name:
+            if not (self._by_ycb_name and known):
                 raise
             own = ", ".join(f"obj_{n:06d}" for n in sorted(numbers_seen))
             raise UserError(
                 f"{base}: its scenes have no '{', '.join(map(str, wanted or []))}' (data.object), "
                 f"YCB-V's name of a number; they have {own}; data.object=null takes all"
+                + (f"; left out: {broken}" if broken else "")
             ) from error
         if wanted is None and self._mesh_frame == "original":  # of others the frame is not known
             related = {*ycb.CLASSES} - ycb.WITHOUT_GEOMETRY

@@ -110,6 +110,7 @@ class FatReader(BaseReader):
             known,
             self.root,
             strip=lambda name: name if name in known else name.removesuffix("_16k"),
+            broken=next(iter(self.examples.values()), ""),
         )
         self._entries: list[_Entry] = []
         numbers_of_scenes = number_scenes(self.root, folders)

@@ -15,16 +15,27 @@ def choose_objects(
     known: Sequence[str],
     root: Path,
     strip: Callable[[str], str] = str,
+    broken: str = "",
 ) -> tuple[str, ...]:
     """Return the wanted classes as the dataset spells them; None: all.
 
-    Raises UserError for any other class.
+    Args:
+        wanted: The classes as typed.
+        known: Those that the dataset has.
+        root: Its folder.
+        strip: Takes off what may be typed beyond a class's name.
+        broken: What is wrong with a file that was left out, where one was.
+
+    Raises:
+        UserError: A wanted class is not known.
     """
     if wanted is None:
         return tuple(known)
     several = isinstance(wanted, Sequence) and not isinstance(wanted, str)
     listed = wanted if several else [wanted]  # a single name may read as a number
     names = tuple(strip(str(name)) for name in listed)
+    if names and broken and not known:
+        raise UserError(f"{broken}; no image is left that could show '{names[0]}' (data.object)")
     for name in names:
         if name not in known:
             number = _BOP_NAME.fullmatch(name)
@@ -32,6 +43,7 @@ def choose_objects(
             near = [meant] if meant in known else []
             near = near or difflib.get_close_matches(name, known, n=1, cutoff=0.5)
             hint = f"did you mean '{near[0]}'?" if near else f"it has {', '.join(known) or 'none'}"
+            hint += f"; left out: {broken}" if broken else ""
             raise UserError(f"{root}: unknown class '{name}' (data.object): {hint}")
     if not names:
         raise UserError(f"{root}: data.object is an empty list: name a class")
