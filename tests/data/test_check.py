@@ -182,6 +182,21 @@ def test_a_mesh_in_another_unit_is_not_taken_for_wrong_poses_and_depth(
     assert re.search(f"the mesh is too {told}", problem)
 
 
+def test_no_factor_is_proposed_that_fits_no_frame(tmp_path, meshes):
+    """Half of the frames have another depth scale than their camera says."""
+    bop_scene(tmp_path / "000001", [[(2, each)] for each in POSES])
+    file = tmp_path / "000001" / "scene_camera.json"
+    cameras = json.loads(file.read_text())
+    for image in "13":
+        cameras[image]["depth_scale"] *= 10
+    file.write_text(json.dumps(cameras))
+    report = check_dataset(BopReader(tmp_path, "obj_000002", meshes), meshes)
+    general, *single = report["problems"]
+    assert "no cause that was tried explains it" in general
+    assert [problem[:24] for problem in single] == [f"one frame, 000001/00000{k}" for k in (1, 3)]
+    assert all("depth is 10 times what the mesh says" in problem for problem in single)
+
+
 def test_a_wrong_mesh_is_a_problem_without_a_cause(tmp_path, meshes):
     wrong = write_mesh(tmp_path / "wrong", NAME)
     path = wrong / NAME / "google_16k" / "textured.obj"

@@ -200,11 +200,9 @@ def _check_object(
     if not fits:
         return row, [*problems, f"{name}: no frame shows it"], tiles
     general = _judge(row, views, fits, geometry)
-    # what is wrong with most frames is told once
-    single = [one for one in suspects if one.flaw] if general else suspects
-    explained = any("no cause" not in problem for problem in general)
-    if not explained:
-        general += describe_suspects(single, geometry)
+    if all("no cause" in problem for problem in general):
+        # what is wrong with most frames is told once, unless they differ
+        general += describe_suspects(suspects, geometry, only_explained=bool(general))
     return row, problems + general, tiles
 
 

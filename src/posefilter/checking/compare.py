@@ -160,12 +160,15 @@ def _tell_factor(factor: float) -> str:
 
 
 def _measure_depth(fits: Sequence[Fit]) -> float:
-    """Return measured over rendered depth, where silhouettes agree; NaN where that varies."""
+    """Return measured over rendered depth, where silhouettes agree; NaN where that varies, in
+    a frame or between them.
+    """
     good = [fit for fit in fits if fit.iou > 0.7 and np.isfinite(fit.depth_ratio)]
     if not good:
         return float("nan")
-    ratio = float(np.median([fit.depth_ratio for fit in good]))
-    spread = float(np.median([fit.ratio_spread for fit in good]))
+    ratios = [fit.depth_ratio for fit in good]
+    ratio = float(np.median(ratios))
+    spread = max(float(np.median([fit.ratio_spread for fit in good])), float(np.ptp(ratios)))
     return ratio if spread <= 0.1 * ratio else float("nan")
 
 

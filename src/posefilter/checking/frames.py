@@ -37,12 +37,15 @@ def is_suspect(view: View, fit: Fit) -> bool:
     return fit.iou < LEAST_FRAME_IOU or off
 
 
-def describe_suspects(suspects: Sequence[Suspect], geometry: Geometry) -> list[str]:
+def describe_suspects(
+    suspects: Sequence[Suspect], geometry: Geometry, only_explained: bool = False
+) -> list[str]:
     """Return a sentence for each frame, with the likely cause.
 
     Args:
         suspects: The frames; for the first ten causes are tried.
         geometry: Renders their meshes.
+        only_explained: Leave out frames whose cause is not found.
     """
     out = []
     for k, one in enumerate(suspects):
@@ -51,6 +54,8 @@ def describe_suspects(suspects: Sequence[Suspect], geometry: Geometry) -> list[s
             out.append(f"{words}{one.flaw}")
             continue
         causes = _find_causes(one, geometry) if k < _MOST_TRIED else []
+        if only_explained and not causes:
+            continue
         numbers = f"silhouette IoU {one.fit.iou:.2f}"
         if not math.isnan(one.fit.depth_error_mm):  # mask and mesh overlap
             numbers += f", depth {one.fit.depth_error_mm:.0f} mm off"
