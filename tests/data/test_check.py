@@ -182,14 +182,56 @@ def test_a_mesh_in_another_unit_is_not_taken_for_wrong_poses_and_depth(
     assert re.search(f"the mesh is too {told}", problem)
 
 
+def invert_masks(folder, files="*"):
+    for file in (folder / "mask_visib").glob(f"{files}.png"):
+        cv2.imwrite(str(file), 255 - cv2.imread(str(file), cv2.IMREAD_UNCHANGED))
+
+
+@pytest.mark.parametrize("units", [1.0, 10.0])
+def test_inverted_masks_are_no_translations(tmp_path, meshes, units):
+    """An object that is ten times nearer would fill the image, as nearly all of the mask is set."""
+    folder = tmp_path / "000001"
+    bop_scene(folder, [[(2, each), (3, FRONT)] for each in POSES])
+    change_cameras(folder, "0123", units)
+    invert_masks(folder)
+    problems = check_dataset(BopReader(tmp_path, "obj_000002", meshes), meshes)["problems"]
+    words = [r"^obj_000002: masks are inverted: 255 is the object, 0 all else"]
+    words += ["depth is 10 times what the mesh says"] if units == 10 else []
+    assert len(problems) == len(words), problems
+    assert all(map(re.search, words, problems)), problems
+
+
+def test_a_single_mask_that_is_inverted_is_named(tmp_path, meshes):
+    bop_scene(tmp_path / "000001", [[(2, each)] for each in POSES])
+    invert_masks(tmp_path / "000001", "000002_*")
+    (problem,) = check_dataset(BopReader(tmp_path, "obj_000002", meshes), meshes)["problems"]
+    assert problem.startswith("one frame, 000001/000002 obj_000002: masks are inverted")
+
+
+def test_no_silhouette_of_a_whole_image_is_a_translation(tmp_path, meshes):
+    """A mask of nearly all of the image, for whatever reason, does not mean that poses are far."""
+    folder = tmp_path / "000001"
+    bop_scene(folder, [[(2, each)] for each in POSES])
+    for file in (folder / "mask_visib").iterdir():
+        mask = np.full((120, 160), 255, np.uint8)
+        mask[0] = 0
+        cv2.imwrite(str(file), mask)
+    problems = check_dataset(BopReader(tmp_path, "obj_000002", meshes), meshes)["problems"]
+    assert not [problem for problem in problems if "translations" in problem], problems
+
+
+def change_cameras(folder, images, factor):
+    file = folder / "scene_camera.json"
+    cameras = json.loads(file.read_text())
+    for image in images:
+        cameras[image]["depth_scale"] *= factor
+    file.write_text(json.dumps(cameras))
+
+
 def test_no_factor_is_proposed_that_fits_no_frame(tmp_path, meshes):
     """Half of the frames have another depth scale than their camera says."""
     bop_scene(tmp_path / "000001", [[(2, each)] for each in POSES])
-    file = tmp_path / "000001" / "scene_camera.json"
-    cameras = json.loads(file.read_text())
-    for image in "13":
-        cameras[image]["depth_scale"] *= 10
-    file.write_text(json.dumps(cameras))
+    change_cameras(tmp_path / "000001", "13", 10)
     report = check_dataset(BopReader(tmp_path, "obj_000002", meshes), meshes)
     general, *single = report["problems"]
     assert "no cause that was tried explains it" in general

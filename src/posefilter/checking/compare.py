@@ -3,7 +3,7 @@ they disagree.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -17,6 +17,8 @@ from posefilter.meshes.store import Mesh
 
 IN_FRONT = 0.015  # [m] nearer than the rendered surface by this: something else is seen there
 _RATIO_TOLERANCE = 0.05
+_GOOD_IOU = 0.7  # of silhouettes, above which they agree
+_WHOLE = 0.75  # share of an image: a larger silhouette, of what is too near, fits many masks
 # of pictures whose intrinsics may have been mixed up
 _WIDTHS = (160, 320, 480, 640, 720, 960, 1280, 1920)
 _POWERS = (0.001, 0.01, 0.1, 10.0, 100.0, 1000.0)
@@ -84,26 +86,46 @@ def likely_causes(views: Sequence[View], geometry: Geometry, before: float) -> l
     """Return in words what is probably wrong with poses, frames, intrinsics and depth; `before`:
     the median IoU as it is.
     """
+    fits = [compare(_invert(view), geometry) for view in views]
+    after = float(np.median([fit.iou for fit in fits]))
+    if after > max(before, _GOOD_IOU):
+        said = f"masks are inverted: 255 is the object, 0 all else {_list_ious(before, after)}"
+        return [said, *_depth_scale(fits)]
     undone = [list_causes(view) for view in views]
     words = [one[0] for one in undone[0]]
-    fits = []
+    tried = []
     for number in range(len(words)):
         own = [(view, *causes[number][1:]) for view, causes in zip(views, undone, strict=True)]
-        fits.append([compare(view, geometry, pose, K) for view, pose, K in own])
-    scores = [float(np.median([fit.iou for fit in each])) for each in fits]
+        tried.append([compare(view, geometry, pose, K) for view, pose, K in own])
+    scores = [float(np.median([fit.iou for fit in each])) for each in tried]
+    for number in range(len(_POWERS)):  # of the translations
+        if np.median([(fit.rendered > 0).mean() for fit in tried[number]]) > _WHOLE:
+            scores[number] = 0.0
     best = int(np.argmax(scores))
     as_read = [compare(view, geometry) for view in views]
     found, judged = [], as_read
-    if scores[best] > before + max(0.05, 0.5 * (1 - before)) and scores[best] > 0.7:
-        ious = f"(silhouette IoU {before:.2f}, with that undone {scores[best]:.2f})"
+    if scores[best] > before + max(0.05, 0.5 * (1 - before)) and scores[best] > _GOOD_IOU:
+        ious = _list_ious(before, scores[best])
         found.append(f"{words[best]} {ious}")
-        judged = fits[best]
+        judged = tried[best]
         factor = _POWERS[best] if best < len(_POWERS) else 1.0  # of the translations
         # an object as many times larger and farther looks the same
         if factor != 1 and abs(_measure_depth(judged) * factor - 1) < 0.1:
             larger = _tell_factor(1 / factor)
             return [f"the mesh is too {larger}: multiply mesh_scale by {1 / factor:g} {ious}"]
     return found + _depth_scale(judged)
+
+
+def _invert(view: View) -> View:
+    """Return a view with its mask inverted; of those of others, which then are, too, nothing is
+    known.
+    """
+    sample = replace(view.sample, mask=~view.sample.mask)
+    return replace(view, sample=sample, others=np.zeros_like(view.others))
+
+
+def _list_ious(before: float, after: float) -> str:
+    return f"(silhouette IoU {before:.2f}, with that undone {after:.2f})"
 
 
 def half_pixel(views: Sequence[View], geometry: Geometry, before: float) -> str | None:
@@ -163,7 +185,7 @@ def _measure_depth(fits: Sequence[Fit]) -> float:
     """Return measured over rendered depth, where silhouettes agree; NaN where that varies, in
     a frame or between them.
     """
-    good = [fit for fit in fits if fit.iou > 0.7 and np.isfinite(fit.depth_ratio)]
+    good = [fit for fit in fits if fit.iou > _GOOD_IOU and np.isfinite(fit.depth_ratio)]
     if not good:
         return float("nan")
     ratios = [fit.depth_ratio for fit in good]
