@@ -149,3 +149,14 @@ def test_weights_that_a_recipe_names_are_not_read(secret: Path, watch: Any) -> N
         with watch:
             made = instantiate(without_pretrained({"pieces": [node]}), "context")
         assert isinstance(made["pieces"][0], torch.nn.Module)
+
+
+def test_what_a_plug_in_calls_weights_is_kept() -> None:
+    """A loss that weighs its terms is built again as it was trained."""
+    from posefilter.cli.recipe import without_pretrained
+
+    loss = {"_target_": "hostile_plugin.Thing", "weights": [5.0, 1.0]}
+    trunk = {"_target_": "posefilter.nets.resnet.ResNet", "weights": "a.pth"}
+    made = without_pretrained({"loss": loss, "model": {"_target_": "own.Net", "trunk": trunk}})
+    assert made["loss"] == loss
+    assert made["model"]["trunk"]["weights"] is None

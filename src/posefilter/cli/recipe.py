@@ -25,8 +25,9 @@ NOT_KEPT = (
     *("warm_start", "out", "folder", "trainer", "callbacks", "logger", "resume", "debug"),
     *("console", "plugins", "tags", "hydra"),
 )
-# settings that name files to start a training from: the checkpoint has what came of them
-PRETRAINED = ("weights",)
+# a setting of posefilter's own networks that names a file to start a training from: the checkpoint
+# has what came of it
+_PRETRAINED = "weights"
 _DEEPEST, _MOST_NODES, _LONGEST = 16, 20_000, 1000
 MOST_WHOLE = 1_000_000  # a setting that is a whole number; none may be less than its range allows
 LIMITS = {
@@ -97,10 +98,14 @@ def check_recipe(recipe: Any) -> dict[str, Any]:
 
 
 def without_pretrained(node: Any) -> Any:
-    """Return settings that name no file of weights: those of the checkpoint take their place."""
+    """Return settings that name no file of weights: those of the checkpoint take their place.
+
+    What a plug-in calls `weights` may be anything, and stays.
+    """
     if isinstance(node, dict):
         plain = {key: without_pretrained(value) for key, value in node.items()}
-        return plain | {key: None for key in PRETRAINED if key in node and "_target_" in node}
+        own = _PRETRAINED in node and str(node.get("_target_")).startswith("posefilter.")
+        return plain | {_PRETRAINED: None} if own else plain
     return [without_pretrained(value) for value in node] if isinstance(node, list) else node
 
 
