@@ -24,7 +24,7 @@ from posefilter.filters.reweight import CurrentLikelihood
 from posefilter.filters.schedule import Constant
 from posefilter.geometry.lookup import sample
 from posefilter.geometry.spaces import PixelSpace
-from posefilter.models.base import PoseEstimator
+from posefilter.models.base import PoseEstimator, with_lightning
 from posefilter.models.box_heads import QuantileBox
 from posefilter.models.rehearsal import check_method
 from posefilter.types import ParticleOutput
@@ -383,3 +383,14 @@ def test_a_checkpoint_without_its_recipe_is_refused_before_the_training() -> Non
     with pytest.raises(UserError, match=r"Nests\.on_save_checkpoint: checkpoint\['mine'\]"):
         rehearse(build(Nests))
     rehearse(build(Keeps))
+
+
+def test_a_method_that_saves_its_settings_once_more_is_refused_when_it_is_built() -> None:
+    class Saves(Own):
+        def __init__(self, **base: Any) -> None:
+            super().__init__(**base)
+            self.save_hyperparameters(ignore=["loss"])
+
+    for kind in (Saves, with_lightning(Saves)):
+        with pytest.raises(UserError, match=r"^Saves: calls save_hyperparameters\(\), .* recipe"):
+            build(kind)

@@ -484,6 +484,17 @@ class PoseEstimator(Module):
 
     # -- checkpoints -------------------------------------------------------------------------------
 
+    def save_hyperparameters(self, *_: Any, **__: Any) -> None:
+        """Refuse what Lightning would add to checkpoints: no command could read them.
+
+        Raises:
+            UserError: Always.
+        """
+        raise UserError(
+            f"{type(self).__name__}: calls save_hyperparameters(), and no command could read its "
+            "checkpoints; leave it out, since their recipe holds the settings"
+        )
+
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Save the object and the recipe, as plain tensors, numbers and strings."""
         checkpoint["recipe"] = self.recipe
