@@ -2,10 +2,12 @@
 gives no pose, and a box.
 """
 
+import json
 from itertools import product
 from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from tests.models.test_pose_pf import working
@@ -14,6 +16,7 @@ from tests.models.toy import scenes, square
 
 from posefilter.errors import UserError
 from posefilter.filters.estimate import Argmax
+from posefilter.metrics.results import flatten
 from posefilter.models.base import PoseEstimator
 from posefilter.types import BeliefBatch
 
@@ -153,3 +156,20 @@ def test_a_method_without_pose_and_box_is_refused() -> None:
     with pytest.raises(UserError, match=r"NoBox: `provides` lacks pose, so .* box\(\) of its own"):
         build(NoBox)
     assert build(HasPose).object_model.name == square().name
+
+
+@pytest.mark.parametrize("value", [torch.tensor(0.25), np.float32(0.25), np.array(0.25), 0.25])
+def test_a_metric_of_torchmetrics_is_logged_and_written(value: Any) -> None:
+    """Its `compute` returns a tensor of no dimension."""
+
+    class Measures(Own):
+        def compute_metrics(self) -> dict[str, Any]:
+            return super().compute_metrics() | {"own": {"spread": value}, "name": "text"}
+
+    method = build(Measures).eval()
+    with torch.no_grad():
+        method.validation_step(scenes(2), 0)
+    found = method.collect_results()
+    assert json.loads(json.dumps(found))["own"] == {"spread": 0.25}
+    assert flatten(found)["own/spread"] == 0.25
+    assert found["name"] == "text"

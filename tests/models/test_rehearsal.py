@@ -352,6 +352,51 @@ def test_a_method_that_needs_its_trainer_is_not_refused() -> None:
     rehearse(build(Asks))
 
 
+# -- metrics ----------------------------------------------------------------------------------
+
+
+def measuring_by(value: Any) -> type[PoseEstimator]:
+    class Measures(Own):
+        def compute_metrics(self) -> dict[str, Any]:
+            return super().compute_metrics() | {"own": {"spread": value}}
+
+    return Measures
+
+
+METRICS = {
+    "vector": (torch.ones(3), r"'own/spread' is a Tensor of shape \(3,\), not a number"),
+    "array": (np.ones((1, 2)), r"'own/spread' is a ndarray of shape \(1, 2\), not a number"),
+    "object": ([object()], "'own/spread' is a object, not a number"),
+}
+
+
+@pytest.mark.parametrize("mistake", METRICS)
+def test_a_metric_that_is_no_number_is_named(mistake: str) -> None:
+    value, told = METRICS[mistake]
+    with pytest.raises(UserError, match=rf"^Measures\.compute_metrics: {told}$"):
+        rehearse(build(measuring_by(value)))
+
+
+def test_a_metric_that_cannot_be_updated_is_noticed_before_the_training() -> None:
+    class Measures(Own):
+        def update_metrics(self, trace: Any, batch: Any) -> None:
+            super().update_metrics(trace, batch)
+            self.scores["spread"].update(trace.belief.best)
+
+    with pytest.raises(KeyError, match="spread"):
+        rehearse(build(Measures))
+
+
+def test_a_metric_that_needs_more_images_is_not_refused() -> None:
+    class Measures(Own):
+        def compute_metrics(self) -> dict[str, Any]:
+            if self.scores["iou"].count < 2:
+                raise ValueError("at least two images")
+            return super().compute_metrics()
+
+    rehearse(build(Measures))
+
+
 # -- checkpoints ------------------------------------------------------------------------------
 
 

@@ -125,7 +125,7 @@ def _of_checkpoint(job: Job) -> tuple[dict[str, Any], dict[str, Path]]:
     write_beliefs(files["beliefs"], records.outcomes, data.records("test"), native)
     tested = replace(job, choices={**checkpoint["recipe"]["choices"], **chosen(job)})
     source = Path(job.cfg.checkpoint)
-    found = record(method.compute_metrics(), tested, data.describe(), source, device)
+    found = record(method.collect_results(), tested, data.describe(), source, device)
     return found, files
 
 

@@ -267,7 +267,7 @@ def test(run: Run, checkpoint: dict[str, Any], tested_at: Trained) -> dict[str, 
     except Stopped:
         say_stopped(run)
         raise
-    return method.compute_metrics()
+    return method.collect_results()
 
 
 def finish(

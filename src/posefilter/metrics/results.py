@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 from typing import Any
 
+from posefilter.errors import UserError
 from posefilter.metrics.scores import overall
 
 
@@ -39,3 +40,28 @@ def flatten(results: Mapping[str, Any], prefix: str = "") -> dict[str, float]:
         elif isinstance(value, int | float) and not isinstance(value, bool):
             out[prefix + name] = float(value)
     return out
+
+
+def to_numbers(results: Any, who: str, key: str = "") -> Any:
+    """Return nested results as metrics.json has them: a metric's tensor of no dimension, and a
+    scalar of NumPy, become a number.
+
+    Args:
+        results: Mappings and lists of numbers, texts and None.
+        who: What computed them.
+        key: The joined name of their place.
+
+    Raises:
+        UserError: A value is none of these.
+    """
+    if isinstance(results, Mapping):
+        below = f"{key}/" if key else ""
+        return {str(name): to_numbers(one, who, f"{below}{name}") for name, one in results.items()}
+    if isinstance(results, list | tuple):
+        return [to_numbers(one, who, key) for one in results]
+    shape = getattr(results, "shape", None)
+    value = results.item() if shape == () else results
+    if not (value is None or isinstance(value, int | float | str)):
+        kind = f"{type(value).__name__}{'' if shape is None else f' of shape {(*shape,)}'}"
+        raise UserError(f"{who}: '{key}' is a {kind}, not a number")
+    return value

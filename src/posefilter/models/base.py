@@ -33,7 +33,7 @@ from posefilter.filters.texture import LEARNED_PIXELS, LEARNED_SIGMA
 from posefilter.geometry.camera import project
 from posefilter.geometry.pose import origin_of
 from posefilter.geometry.spaces import PoseSpace
-from posefilter.metrics.results import compute_checkpoint_score, flatten
+from posefilter.metrics.results import compute_checkpoint_score, flatten, to_numbers
 from posefilter.models import evaluation
 from posefilter.models.box_heads import PoseBox
 from posefilter.models.clipping import SubmoduleClipper
@@ -438,8 +438,16 @@ class PoseEstimator(Module):
         self.last_belief = evaluation.update_metrics(self, trace, batch)
 
     def compute_metrics(self) -> dict[str, Any]:
-        """Return the metrics since the last reset, in the form of metrics.json."""
+        """Return the metrics since the last reset, nested as metrics.json has them."""
         return evaluation.compute_metrics(self)
+
+    def collect_results(self) -> dict[str, Any]:
+        """Return what `compute_metrics` does as plain numbers, as metrics.json holds them.
+
+        Raises:
+            UserError: A value is no number.
+        """
+        return dict(to_numbers(self.compute_metrics(), f"{type(self).__name__}.compute_metrics"))
 
     def train(self, mode: bool = True) -> Self:
         """Switch to training or evaluation."""
@@ -476,7 +484,7 @@ class PoseEstimator(Module):
         The logger is to put them at the step that the model has come to: by itself Lightning counts
         from 0, one less, and adds the epoch.
         """
-        results = self.compute_metrics()
+        results = self.collect_results()
         for name, value in self.trained._asdict().items():
             self.log(name, float(value))
         self.log_dict({f"{split}/{name}": value for name, value in flatten(results).items()})

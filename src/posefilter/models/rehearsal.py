@@ -1,7 +1,8 @@
 """Whether the parts of a method return what their protocols say: asked once, before a training.
 
-A copy of the method looks at two images, one as a validation and one as a training does, while
-each of its parts is watched. The method itself is left as it is, and so are the random numbers.
+A copy of the method looks at two images, one as a validation does, with its metrics, and one as a
+training does, while each of its parts is watched. The method itself is left as it is, and so are
+the random numbers.
 """
 
 import inspect
@@ -69,11 +70,19 @@ def check_method(method: PoseEstimator, seen: Batch, learned: Batch | None) -> N
 
 
 def _look(method: PoseEstimator, seen: Batch) -> None:
+    """Check a validation of one batch, and what is logged of it."""
     with torch.no_grad():
-        box = method.box(method.predict_step(seen, 0), seen)
-    _check_tensor(
-        f"{type(method).__name__}.box", "what it returned", box, (len(seen.rgb), 4), torch.float64
-    )
+        trace = method.predict_step(seen, 0)
+        box = method.box(trace, seen)
+        who, shape = f"{type(method).__name__}.box", (len(seen.rgb), 4)
+        _check_tensor(who, "what it returned", box, shape, torch.float64)
+        method.update_metrics(trace, seen)
+    try:
+        method.collect_results()
+    except UserError:
+        raise
+    except Exception as error:  # some metrics need more images; others are raised again
+        log.debug("no metrics could be computed of one image: %r", error)
 
 
 def _learn(method: PoseEstimator, learned: Batch) -> None:
