@@ -15,7 +15,7 @@ from torch import Tensor, nn
 
 from posefilter.errors import UserError
 from posefilter.filters.estimate import Argmax
-from posefilter.filters.initialize import UniformPixels
+from posefilter.filters.initialize import FromDepth, UniformPixels
 from posefilter.filters.loop import ParticleFilter
 from posefilter.filters.propagate import Gaussian
 from posefilter.filters.refine import NoRefine
@@ -26,6 +26,7 @@ from posefilter.geometry.lookup import sample
 from posefilter.geometry.spaces import PixelSpace
 from posefilter.models.base import PoseEstimator, with_lightning
 from posefilter.models.box_heads import QuantileBox
+from posefilter.models.pose_particles import PoseParticles
 from posefilter.models.rehearsal import check_method
 from posefilter.types import ParticleOutput
 
@@ -350,6 +351,40 @@ def test_a_method_that_needs_its_trainer_is_not_refused() -> None:
             raise RuntimeError("Asks is not attached to a `Trainer`")
 
     rehearse(build(Asks))
+
+
+def naming(name: str) -> type[PoseEstimator]:
+    class Names(Own):
+        def __init__(self, **base: Any) -> None:
+            super().__init__(**base)
+            setattr(self, name, nn.Linear(4, 3))
+
+        def measure(self, *args: Any) -> Any:
+            self.net = getattr(self, name)
+            return super().measure(*args)
+
+    return Names
+
+
+@pytest.mark.parametrize("name", ["model", "likelihood", "proposals"])
+def test_a_network_may_have_the_name_of_another_methods(name: str) -> None:
+    for kind in (naming(name), with_lightning(naming(name))):
+        rehearse(build(kind))
+
+
+def test_a_network_of_poses_may_be_called_as_that_of_object_coordinates() -> None:
+    class Poses(PoseParticles):
+        def __init__(self, **base: Any) -> None:
+            super().__init__(**base)
+            self.proposals = nn.Conv2d(4, 7, 1)
+
+    assert build(Poses, initialize=FromDepth()).space.dimensions == 6
+
+
+@pytest.mark.parametrize("name", ["box", "space", "scores", "encode"])
+def test_a_network_that_the_class_would_hide_is_named(name: str) -> None:
+    with pytest.raises(UserError, match=f"^Names: its network `{name}` is hidden by .* class"):
+        build(naming(name))
 
 
 # -- metrics ----------------------------------------------------------------------------------

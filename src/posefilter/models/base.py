@@ -116,8 +116,14 @@ class PoseEstimator(Module):
 
         Raises:
             UserError: The method's components do not fit each other, see capabilities.py; or it has
-                neither a pose nor a box of its own.
+                neither a pose nor a box of its own, or a network that its class hides.
         """
+        for name in self._modules:
+            if hasattr(type(self), name):  # which Python finds first
+                raise UserError(
+                    f"{type(self).__name__}: its network `{name}` is hidden by what the class has "
+                    "under this name; give the network another name"
+                )
         check_parts(self)
         check_zoom(self)
         if type(self).box is PoseEstimator.box and "pose" not in collect_provided(self):
@@ -145,11 +151,6 @@ class PoseEstimator(Module):
                 "the method has no object yet: give it data, or a checkpoint that holds one"
             )
         return self._object_model
-
-    @property
-    def model(self) -> ObjectModel:
-        """The earlier name of `object_model`."""
-        return self.object_model
 
     @property
     def device(self) -> torch.device:

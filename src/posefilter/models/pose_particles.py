@@ -5,7 +5,7 @@ from typing import Any, ClassVar
 
 from torch import Generator, Tensor
 
-from posefilter.capabilities import Capabilities
+from posefilter.capabilities import Capabilities, read_declared
 from posefilter.confidence.apparent_size import ApparentSize, measure_apparent_size
 from posefilter.confidence.features import measure_coordinates
 from posefilter.errors import UserError
@@ -52,7 +52,8 @@ class PoseParticles(PoseEstimator):
     @property
     def _coordinate_net(self) -> ObjectCoordinateNet | None:
         """The network of dense object coordinates, of those methods that have one."""
-        return getattr(self, "proposals", None)
+        network = getattr(self, "proposals", None)
+        return network if "object_coordinates" in read_declared(type(network)).provides else None
 
     def collect_features(
         self, trace: Trace, batch: Batch, margin: Tensor | None = None

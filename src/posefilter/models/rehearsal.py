@@ -22,6 +22,7 @@ from torch import Tensor, nn
 from posefilter.errors import UserError
 from posefilter.geometry.pose import is_rigid
 from posefilter.models.base import PoseEstimator
+from posefilter.models.pose_pf import PosePF
 from posefilter.pickles import check_pickle
 from posefilter.types import Batch, BeliefBatch, ParticleOutput, Particles, Resampled, Step, Trace
 
@@ -204,8 +205,8 @@ class _Watcher:
             for name in _VERBS:
                 self._extend(getattr(one, name), __call__=getattr(self, f"_{name}"))
         self._extend(method.loss, __call__=self._loss)
-        if isinstance(likelihood := getattr(method, "likelihood", None), nn.Module):
-            self._extend(likelihood, __call__=self._likelihood)
+        if isinstance(method, PosePF):  # what others call so is their own
+            self._extend(method.likelihood, __call__=self._likelihood)
         watches: dict[str, Watch] = {"measure": self._measure}
         if hasattr(method, "score_poses"):
             watches["score_poses"] = self._score_poses
