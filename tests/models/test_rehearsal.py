@@ -24,6 +24,10 @@ from posefilter.filters.reweight import CurrentLikelihood
 from posefilter.filters.schedule import Constant
 from posefilter.geometry.lookup import sample
 from posefilter.geometry.spaces import PixelSpace
+from posefilter.labels.displacement import TowardsObject
+from posefilter.labels.membership import OnObject
+from posefilter.losses.displacement import DirectDisplacement
+from posefilter.losses.likelihood import Focal
 from posefilter.models.base import PoseEstimator, with_lightning
 from posefilter.models.box_heads import QuantileBox
 from posefilter.models.pose_particles import PoseParticles
@@ -283,6 +287,50 @@ def test_a_loss_of_another_signature_is_named() -> None:
 
     with pytest.raises(UserError, match=r"Wrong.__call__\(self, trace.*takes other arguments"):
         rehearse(build(loss=Wrong()))
+
+
+class Label(OnObject):
+    change: Any = staticmethod(lambda label: label)
+
+    def __call__(self, *args: Any) -> Any:
+        return self.change(super().__call__(*args))
+
+
+def labeling(change: Any) -> Any:
+    return type("Center", (Label,), {"change": staticmethod(change)})()
+
+
+class Masked:
+    """A loss of one's own, whose label is bool."""
+
+    def __init__(self, label: Any) -> None:
+        self.label = label
+
+    def __call__(self, trace: Any, batch: Any, object_model: Any) -> Tensor:
+        on = self.label(trace, batch, object_model)[-1]
+        return (trace.outputs[-1].log_likelihood * on).mean(1)
+
+
+LABELS = {
+    "last": (lambda x: x[-1], r"Center: the label has the shape \(2, 16\), not \(3, 2, 16\)"),
+    "image": (lambda x: x[..., :1], r"Center: the label has the shape \(3, 2, 1\)"),
+    "wide": (lambda x: x[..., None], r"the shape \(3, 2, 16, 1\), not \(3, 2, 16, 2\)"),
+    "nan": (lambda x: x / 0, "Center: the label is not finite"),
+    "list": (lambda x: [*x], r"Center: the label is a list, not a tensor \(3, 2, 16\)"),
+}
+
+
+@pytest.mark.parametrize("mistake", LABELS)
+def test_a_label_that_returns_something_else_is_named(mistake: str) -> None:
+    change, told = LABELS[mistake]
+    with pytest.raises(UserError, match=told):
+        rehearse(build(loss=Focal(labeling(change), steps="last")))
+
+
+def test_a_label_of_the_protocols_shape_is_accepted() -> None:
+    rehearse(build(loss=Focal(labeling(lambda x: x))))
+    rehearse(build(loss=DirectDisplacement(TowardsObject())))
+    rehearse(build(loss=Masked(labeling(lambda x: x > 0))))
 
 
 # -- methods ----------------------------------------------------------------------------------

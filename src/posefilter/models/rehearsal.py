@@ -19,6 +19,7 @@ from lightning import LightningModule
 from lightning.pytorch.utilities.seed import isolate_rng
 from torch import Tensor, nn
 
+from posefilter.capabilities import list_parts
 from posefilter.errors import UserError
 from posefilter.geometry.pose import is_rigid
 from posefilter.models.base import PoseEstimator
@@ -199,12 +200,15 @@ class _Watcher:
         self._known: set[int] = set()
 
     def watch(self) -> None:
-        """Watch the method, its filters, its likelihood and its loss."""
+        """Watch the method, its filters, its likelihood, its loss and the labels of its losses."""
         method = self.method
         for one in (method.filter, method.train_filter):
             for name in _VERBS:
                 self._extend(getattr(one, name), __call__=getattr(self, f"_{name}"))
         self._extend(method.loss, __call__=self._loss)
+        for part in list_parts([method.loss, getattr(method, "aux_losses", None)]):
+            if callable(label := getattr(part, "label", None)):
+                self._extend(label, __call__=self._label)
         if isinstance(method, PosePF):  # what others call so is their own
             self._extend(method.likelihood, __call__=self._likelihood)
         watches: dict[str, Watch] = {"measure": self._measure}
@@ -347,6 +351,18 @@ class _Watcher:
     def _loss(self, who: str, call: Watch, trace: Trace, batch: Batch, *_: Any) -> Any:
         out = call()
         _check_loss(who, "the loss", out, len(batch.rgb), _learns(self.method))
+        return out
+
+    def _label(self, who: str, call: Watch, trace: Any, *_: Any) -> Any:
+        out = call()
+        # a loss of one's own may call it in its own way
+        if not (isinstance(trace, Trace) and trace.particles):
+            return out
+        (B, N), *others = {tuple(one.log_weights.shape) for one in trace.particles}
+        shape = (len(trace.particles), B, None if others else N)  # N may differ from step to step
+        more = (self.method.space.dimensions,) if getattr(out, "ndim", 0) > len(shape) else ()
+        dtype = getattr(out, "dtype", torch.float32)  # a label may be bool
+        _check_tensor(who, "the label", out, (*shape, *more), dtype)
         return out
 
 
