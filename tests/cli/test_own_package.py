@@ -321,6 +321,36 @@ def test_so_is_one_whose_choice_has_the_name_of_another(
         posefilter.compose()
 
 
+@pytest.mark.parametrize("named", ["", "another", "ownpf"])
+def test_so_are_two_plug_ins_that_have_the_same_choice(
+    named: str,
+    with_choices: Path,
+    entry_point: None,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capfd: pytest.CaptureFixture[str],
+) -> None:
+    """The one that is hidden is refused where it was named, and warned of where it is installed."""
+
+    class Second:
+        name, value = "second", "another"
+
+    points = [*trust.entry_points(group=trust.ENTRY_POINTS), Second()]
+    monkeypatch.setattr(trust, "entry_points", lambda group: points)
+    monkeypatch.delitem(sys.modules, "another", raising=False)
+    first = with_choices.parent / "another" / "conf" / "loss" / "own.yaml"
+    first.parent.mkdir(parents=True)
+    (with_choices.parent / "another" / "__init__.py").write_text("")
+    first.write_text("_target_: another.Loss\n")
+    hidden = with_choices / "conf" / "loss" / "own.yaml"
+    run_command("report", HOME, [f"run={tmp_path}", *([f"plugins=[{named}]"] if named else [])])
+    line, *others = capfd.readouterr().err.strip().splitlines()
+    warned = "warning: installed plug-in ownpf (entry point mine)"
+    start = "report" if named == "ownpf" else warned
+    assert line.startswith(f"{start}: {hidden.resolve()}: has the name of {first.resolve()}, which")
+    assert not any("has the name" in one for one in others)
+
+
 def test_a_package_that_is_not_trusted_is_named(tmp_path: Path) -> None:
     with pytest.raises(UserError) as told:
         instantiate({"_target_": "somebodys.method.Own"}, "model")

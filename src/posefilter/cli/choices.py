@@ -51,7 +51,8 @@ def check_choices(arguments: list[str], conf: Path, command: str | None = None) 
     check_variants(typed, conf)
     if command == "train" and "ablation" in typed:
         check_ablations(typed, conf)
-    check_names([conf, *find_folders(named()), *config_folders(arguments)])
+    asked = [*find_folders(named()), *config_folders(arguments)]
+    check_names([conf, *choice_folders(arguments)], asked)
 
 
 def check_added(
@@ -85,13 +86,19 @@ def check_added(
             )
 
 
-def check_names(folders: Sequence[Path]) -> None:
-    """Raise UserError where a file is hidden by one of its name in an earlier folder."""
+def check_names(folders: Sequence[Path], own: Sequence[Path]) -> None:
+    """Raise UserError where a file is hidden by one of its name in an earlier folder.
+
+    Args:
+        folders: All that are searched, in this order.
+        own: Those of them whose files are to be found.
+    """
     first = dict[Path, Path]()
     for folder in folders:
         for file in sorted(folder.rglob("*.yaml")):
             other = first.setdefault(file.relative_to(folder), file)
-            if other is not file and other.read_bytes() != file.read_bytes():
+            hidden = other is not file and folder in own
+            if hidden and other.read_bytes() != file.read_bytes():
                 raise UserError(
                     f"{file}: has the name of {other}, which would be read in its place; give it "
                     "another name"

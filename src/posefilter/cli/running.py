@@ -146,7 +146,7 @@ def import_installed() -> None:
         try:
             import_plugin(package)
             if package not in named():
-                check_names([find_conf(), *find_folders([package])])
+                check_names([find_conf(), *find_folders(trusted())], find_folders([package]))
         except UserError as error:
             reason = str(error).removeprefix(f"plugins={package}: ")
             told = f"warning: installed plug-in {package} (entry point {name}): {reason}"
