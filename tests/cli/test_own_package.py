@@ -165,6 +165,22 @@ def test_a_method_whose_file_chooses_no_loss_is_told(
     )
 
 
+@pytest.mark.parametrize("chosen", ["/loss: offset", "/filter/resample: none"])
+@pytest.mark.parametrize("under", ["", "model:"])
+def test_a_method_whose_file_lacks_its_first_line_is_told(
+    chosen: str, under: str, package: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    file = tmp_path / "own" / "model" / "mine.yaml"
+    file.parent.mkdir(parents=True)
+    bases = f"defaults: [/model/_base, /preset/_pixels, {{{chosen}}}, _self_]\n"
+    file.write_text(f"{bases}{under} {{_target_: ownpf.method.OwnScore}}\n" if under else bases)
+    typed = ["--config-dir", str(tmp_path / "own"), "model=mine", f"out={tmp_path}/run"]
+    assert run_command("train", HOME, [*typed, "console=json"]) == 2
+    (said,) = capfd.readouterr().err.strip().splitlines()
+    first = "model=mine: the first line of its file must be `# @package _global_`; without it"
+    assert said.startswith(f"train: {first}")
+
+
 def test_the_bases_of_a_method_of_ones_own_choose_all_but_what_differs(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

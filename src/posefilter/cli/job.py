@@ -168,6 +168,8 @@ def check_settings(cfg: DictConfig, command: str, choices: Mapping[str, str] | N
     plain = to_plain(cfg)
     check_ranges(plain, command)
     check_out(cfg)
+    if command == "train" and choices is not None:
+        _check_package(plain, choices)
     for key in _NEEDED.get(command, ()):
         if choices is not None and key not in plain and key not in choices:
             raise UserError(
@@ -191,6 +193,22 @@ def check_settings(cfg: DictConfig, command: str, choices: Mapping[str, str] | N
         raise UserError(f"tags={tags}: must be a list of words, such as tags=[first]")
     if cfg.get("console", "json") not in ("rich", "json"):
         raise UserError(f"console={cfg.console}: choose rich or json")
+
+
+def _check_package(plain: Mapping[str, Any], choices: Mapping[str, str]) -> None:
+    """Refuse the file of a method that lacks its first line: Hydra puts all that it says below
+    `model`.
+    """
+    model = plain.get("model")
+    model = model if isinstance(model, Mapping) else {}
+    nested = isinstance(model.get("model"), Mapping) and "_target_" not in model
+    places = [key.partition("@") for key in choices]
+    chosen = any(place == f"model.{group.replace('/', '.')}" for group, _, place in places)
+    if nested or chosen:
+        raise UserError(
+            f"model={choices.get('model')}: the first line of its file must be "
+            "`# @package _global_`; without it, all that it chooses and sets is below `model`"
+        )
 
 
 def _check_alone(trainer: Mapping[str, Any]) -> None:
