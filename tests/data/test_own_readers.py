@@ -6,6 +6,7 @@ import dataclasses
 import re
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -17,7 +18,7 @@ from posefilter.data.module import PoseDataModule
 from posefilter.data.readers.base import BaseReader
 from posefilter.data.readers.checked import index_records, read_checked
 from posefilter.data.readers.fat import FatReader
-from posefilter.data.readers.registry import READERS, register_reader
+from posefilter.data.readers.registry import READERS, open_reader, register_reader
 from posefilter.errors import UserError
 from posefilter.meshes.store import MeshStore
 
@@ -219,6 +220,53 @@ def test_a_class_that_is_defined_again_takes_its_own_place_and_no_other(
     assert READERS["mine"] is again
     with pytest.raises(UserError, match=r"data.source=fat: a reader .* exists, .*\.FatReader$"):
         register_reader("fat", OwnReader)
+
+
+class WithoutMeshes(BaseReader):
+    def __init__(self, root: Path, objects: str | None = None) -> None:
+        super().__init__(root, None, "raise")
+
+
+class Failing(OwnReader):
+    def __init__(self, *args: Any, stride: int, **given: Any) -> None:
+        super().__init__(*args, **given)
+        sorted([stride], by=3)  # type: ignore[call-overload]
+
+
+def test_a_reader_that_takes_other_arguments_is_named(
+    root: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(READERS, "mine", WithoutMeshes)
+    with pytest.raises(UserError) as refusal:
+        open_reader("mine", root, stride=2)
+    said = str(refusal.value)
+    assert said.startswith(f"data.source=mine: {__name__}.WithoutMeshes must take (root, objects, ")
+    assert said.endswith("(got an unexpected keyword argument 'meshes')")
+
+
+def test_what_is_wrong_with_the_options_is_told_and_an_error_of_the_readers_own_is_left(
+    root: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(READERS, "mine", Failing)
+    with pytest.raises(
+        UserError, match=r"^data\.options: missing a required .* of the mine reader"
+    ):
+        open_reader("mine", root)
+    with pytest.raises(UserError, match=r"^data\.options: got .* 'strid' of the own reader"):
+        open_reader("own", root, strid=2)
+    with pytest.raises(TypeError, match="sort"):
+        open_reader("mine", root, stride=2)
+
+
+@pytest.mark.parametrize("name", ["records", "read", "others", "native_from_mesh"])
+def test_a_function_that_a_reader_lacks_is_named(root: Path, name: str) -> None:
+    class Lacks(BaseReader):
+        pass
+
+    reader = Lacks(root, None, "raise")
+    given = {"records": (), "native_from_mesh": ("toy",)}.get(name, (0,))
+    with pytest.raises(NotImplementedError, match=rf"^Lacks must implement {name}\(\)$"):
+        getattr(reader, name)(*given)
 
 
 def test_what_a_builtin_reader_reads_passes(tmp_path: Path) -> None:

@@ -47,7 +47,16 @@ class BaseReader:
 
     def records(self) -> Sequence[FrameRecord]:
         """Return every object of every image, in a fixed order."""
-        return [entry.record for entry in self._entries]
+        return [entry.record for entry in self._listed("records")]
+
+    def _listed(self, function: str) -> Sequence[Any]:
+        """Return the entries, which a reader that has a function of its own may lack."""
+        if not hasattr(self, "_entries"):
+            raise self._lacks(function)
+        return self._entries
+
+    def _lacks(self, function: str) -> NotImplementedError:
+        return NotImplementedError(f"{type(self).__name__} must implement {function}()")
 
     def add_empty(self) -> None:
         """Add a record of each image that is annotated as showing no object; its class is ""."""
@@ -66,23 +75,23 @@ class BaseReader:
 
         Raises BadData, naming the file, where it is not as it should be.
         """
-        raise NotImplementedError
+        raise self._lacks("read")
 
     def others(self, i: int) -> np.ndarray:
         """Return the pixels that the dataset labels as anything but record i.  -> (H, W) bool."""
-        entry = self._entries[i]
+        entry = self._listed("others")[i]
         label = read_label(self._files(entry.record)[2])
         return (label != 0) & ~self._mask(entry, label)
 
     def _mask(self, entry: Any, label: np.ndarray) -> np.ndarray:
         """Return an entry's part of an image of classes, the third of its record's files."""
-        raise NotImplementedError
+        raise self._lacks("others")
 
     def native_from_mesh(self, name: str) -> np.ndarray:
         """Return the transform from the mesh file's frame into the dataset's own object frame.  ->
         (4, 4) [m].
         """
-        raise NotImplementedError
+        raise self._lacks("native_from_mesh")
 
     def check_diameter(self, name: str, diameter: float) -> None:
         """Raise UserError where the dataset says that an object has another diameter [m]."""

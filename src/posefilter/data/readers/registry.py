@@ -1,5 +1,6 @@
 """Open a dataset by the name of its format."""
 
+import inspect
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -79,16 +80,24 @@ def open_reader(
     for old, new in renamed.items():
         if old in options:
             raise UserError(f"data.options.{old}: is now data.options.{new}")
+    reader = READERS[source]
+    given: dict[str, Any] = {"meshes": meshes, "on_error": on_error}
+    signature = inspect.signature(reader)
     try:
-        return READERS[source](root, objects, meshes=meshes, on_error=on_error, **options)
+        signature.bind_partial(root, objects, **given)
+    except TypeError as error:
+        raise UserError(
+            f"data.source={source}: {_find_home(reader)} must take (root, objects, meshes=, "
+            f"on_error=), as BaseReader's readers do ({error})"
+        ) from error
+    try:
+        signature.bind(root, objects, **given, **options)
+    except TypeError as error:
+        raise UserError(f"data.options: {error} of the {source} reader") from error
+    try:
+        return reader(root, objects, **given, **options)
     except OSError as error:
         raise UserError(f"{error.filename or root}: cannot be read ({error.strerror})") from error
-    except TypeError as error:
-        if "unexpected keyword argument" not in str(error):
-            raise
-        raise UserError(
-            f"data.options: {str(error).split('() ')[-1]} of the {source} reader"
-        ) from error
 
 
 def open_whole(
