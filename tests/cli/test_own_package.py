@@ -367,6 +367,18 @@ def test_so_are_two_plug_ins_that_have_the_same_choice(
     assert not any("has the name" in one for one in others)
 
 
+@pytest.mark.parametrize(
+    ("name", "more"), [("own-pf", " (an import name has `_`, not `-`)"), ("7", "")]
+)
+def test_a_plug_in_that_is_no_package_is_told_before_its_choices(
+    name: str, more: str, with_choices: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """`pip` knows a package by another name than `import`."""
+    assert run_command("train", HOME, [f"plugins=[{name}]", "loss=own"]) == 2
+    told = f"train: plugins={name!r}: not the name of a package{more}"
+    assert capfd.readouterr().err.strip() == told
+
+
 def test_a_package_that_is_not_trusted_is_named(tmp_path: Path) -> None:
     with pytest.raises(UserError) as told:
         instantiate({"_target_": "somebodys.method.Own"}, "model")

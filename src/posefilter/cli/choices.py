@@ -185,10 +185,10 @@ def choice_folders(arguments: Sequence[str]) -> list[Path]:
 
 
 def typed_plugins(arguments: Sequence[str]) -> list[str]:
-    """Return the packages that were typed by `plugins=[...]`."""
+    """Return what was typed by `plugins=[...]`: names of packages, unless they are misspelt."""
     typed = [a.partition("=")[2] for a in arguments if re.match(r"\+{0,2}plugins=", a)]
     words = re.split(r"[\[\],\s'\"]+", typed[-1]) if typed else []
-    return [word for word in words if re.fullmatch(r"[A-Za-z_][\w.]*", word) and word != "null"]
+    return [word for word in words if word not in ("", "null")]
 
 
 def read_settings(conf: Path, command: str) -> dict[str, Any]:

@@ -90,7 +90,8 @@ def trust(package: str) -> None:
     """
     parts = package.split(".") if isinstance(package, str) else [""]
     if not all(part.isidentifier() for part in parts):
-        raise UserError(f"plugins={package!r}: not the name of a package")
+        near = " (an import name has `_`, not `-`)" if "-" in str(package) else ""
+        raise UserError(f"plugins={package!r}: not the name of a package{near}")
     if not _may_be_plugin(parts[0]):
         raise UserError(f"plugins={package}: only a package of your own can be a plug-in")
     if not _is_there(package):
