@@ -228,6 +228,18 @@ def test_advice_has_what_was_typed_of_plug_ins(monkeypatch: pytest.MonkeyPatch) 
     assert console.typed("train", resume="run") == "python train.py resume=run"
 
 
+@pytest.mark.parametrize("kind", ["List", "Sequence", "Tuple", "MutableSequence"])
+def test_a_list_may_be_annotated_without_what_is_in_it(kind: str, package: Path) -> None:
+    (package / "loss.py").write_text(
+        f"import typing\nclass Own:\n    def __init__(self, sizes: typing.{kind}) -> None:\n"
+        "        self.sizes = sizes\n"
+    )
+    node = {"_target_": "ownpf.loss.Own", "sizes": [1, "a"]}
+    assert instantiate(node, "loss").sizes == [1, "a"]
+    with pytest.raises(UserError, match=r"^loss\.sizes=3: must be a (list|tuple|\w*Sequence)$"):
+        instantiate(node | {"sizes": 3}, "loss")
+
+
 @pytest.fixture
 def with_choices(package: Path) -> Path:
     """Return the folder of the plug-in with the choice loss=own inside."""

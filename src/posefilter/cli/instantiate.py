@@ -239,7 +239,8 @@ def fits(value: Any, wanted: Any) -> bool:
             and all(map(fits, value, inner))
         )
     if isinstance(origin, type) and issubclass(origin, Sequence):
-        return isinstance(value, list | tuple) and all(fits(item, inner[0]) for item in value)
+        element = inner[0] if inner else Any  # `List` of typing has no parameter
+        return isinstance(value, list | tuple) and all(fits(item, element) for item in value)
     if isinstance(origin, type) and issubclass(origin, Mapping):
         return isinstance(value, Mapping)
     if isinstance(value, list | tuple | Mapping):  # no component: that is built from a _target_
@@ -274,6 +275,6 @@ def describe(wanted: Any) -> str:
     }
     if (kind := origin or wanted) in words:
         return words[kind]
-    return (
-        str(wanted).replace("typing.", "") if origin else f"a {getattr(wanted, '__name__', wanted)}"
-    )
+    if inner:
+        return str(wanted).replace("typing.", "")
+    return f"a {getattr(kind, '__name__', kind)}"
