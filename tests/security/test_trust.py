@@ -58,6 +58,18 @@ def test_what_it_imports_is_not(name: str, package: str) -> None:
         locate(name, "loss")
 
 
+def test_what_it_imports_from_itself_is_told_by_its_own_name(package: str, tmp_path: Path) -> None:
+    source = "from my_plugin.pieces import Own, make\nOther = Own\nthing = Own()\n"
+    (tmp_path / package / "__init__.py").write_text(source)
+    trust.trust(package)
+    for name, own in {"Own": "Own", "make": "make", "Other": "Own"}.items():
+        told = rf"^loss\._target_=my_plugin\.{name}: is defined as my_plugin\.pieces\.{own}; name"
+        with pytest.raises(UserError, match=told):
+            locate(f"my_plugin.{name}", "loss")
+    with pytest.raises(UserError, match="there is no 'thing' defined in my_plugin"):
+        locate("my_plugin.thing", "loss")
+
+
 @pytest.mark.parametrize(
     "name", ["os", "subprocess", "torch", "posefilter.cli", "not a name", "", "../x"]
 )

@@ -127,6 +127,9 @@ def locate(name: str, where: str, scope: Scope = Scope.CONFIG) -> Callable[..., 
                 f"{said}: is not on the list of what may be built of {module} "
                 f"({', '.join(known)}); a function of a plug-in of yours may return one"
             )
+        real, own_name = (getattr(found, key, "") for key in ("__module__", "__qualname__"))
+        if is_plugin(f"{real}.") and getattr(sys.modules.get(real), own_name, None) is found:
+            raise UserError(f"{said}: is defined as {real}.{own_name}; name that")
         known += [
             key for key, value in vars(home).items() if own and _defined_in(value, module, key)
         ]
