@@ -184,7 +184,7 @@ RANGES: dict[str, Range] = {
     # optimizer, scheduler
     **dict.fromkeys(("lr", "adam_lr", "weight_decay"), Range(0, 10)),
     "momentum": SHARE,
-    "optimizer.eps": Range(0, 1, above=True),
+    "optimizer.eps": Range(0, 1, above=True, many=True),  # Adafactor has two
     "betas": Range(0, 0.999_999_999, many=True),
     "scheduler.warmup_steps": _whole(0, 10**12),
     "scheduler.min_lr_fraction": SHARE,

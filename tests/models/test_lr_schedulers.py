@@ -10,11 +10,14 @@ import pytest
 import torch
 from torch.optim import lr_scheduler
 
+from posefilter.cli.archive import check_archive
 from posefilter.cli.checkpoints import build_method, recipe
 from posefilter.cli.command import compose_job
+from posefilter.cli.plain import to_plain
 from posefilter.errors import UserError
 from posefilter.models.base import PoseEstimator
 from posefilter.models.lr_schedulers import warmup_cosine
+from posefilter.ranges import check_ranges
 
 CONF = Path(__file__).parents[2] / "conf"
 STEPS, RATE = 40, 0.5
@@ -43,10 +46,13 @@ def a_trainer(monkeypatch: pytest.MonkeyPatch) -> None:
 TORCH = {
     "ConstantLR": {},
     "CosineAnnealingLR": {},
+    "CosineAnnealingWarmRestarts": {"T_0": 6, "T_mult": 2},
+    "CyclicLR": {"base_lr": 1e-4, "max_lr": 1e-2, "step_size_up": 5, "mode": "triangular2"},
     "ExponentialLR": {"gamma": 0.9},
     "LinearLR": {"total_iters": 7},
     "MultiStepLR": {"milestones": [3, 5]},
     "OneCycleLR": {"max_lr": 1.0},
+    "PolynomialLR": {"total_iters": 30, "power": 2.0},
     "StepLR": {"step_size": 3},
 }
 LENGTH = {"CosineAnnealingLR": "T_max", "OneCycleLR": "total_steps"}
@@ -63,6 +69,30 @@ def test_torchs_schedules_are_what_their_settings_say(name: str) -> None:
         for one in (made, same):
             one.optimizer.step()
             one.step()
+
+
+@pytest.mark.parametrize("name", ["CosineAnnealingWarmRestarts", "CyclicLR", "PolynomialLR"])
+def test_a_schedules_state_can_be_read_from_a_checkpoint(name: str, tmp_path: Path) -> None:
+    made = schedule(_target_=f"torch.optim.lr_scheduler.{name}", _partial_=True, **TORCH[name])
+    made.optimizer.step()
+    made.step()
+    file = tmp_path / "last.ckpt"
+    torch.save({"lr_schedulers": [made.state_dict()]}, file)
+    check_archive(file)
+    assert torch.load(file, weights_only=True)["lr_schedulers"][0]["last_epoch"] == 1
+
+
+def test_adafactor_takes_the_methods_weights() -> None:
+    node = {"_target_": "torch.optim.Adafactor", "_partial_": True, "eps": [None, 1e-3]}
+    job = compose_job("train", CONF, ["model=cnn_patch", "scheduler=none"], Path())
+    job.cfg.optimizer = node
+    check_ranges(to_plain(job.cfg), "train")
+    method = build_method(recipe(job))
+    optimizer = method.configure_optimizers()
+    sum(weight.square().sum() for weight in method.parameters()).backward()
+    optimizer.step()
+    assert isinstance(optimizer, torch.optim.Adafactor)
+    assert len(optimizer.state) == len([*method.parameters()])
 
 
 def test_a_length_that_is_set_is_kept() -> None:

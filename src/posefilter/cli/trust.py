@@ -29,13 +29,13 @@ COMPONENTS = ("filters", "labels", "losses", "models", "nets")
 # packages of posefilter whose classes the user's own settings may name as well
 _LOOKING = ("callbacks",)
 _OPTIMIZERS = (
-    *("ASGD", "Adadelta", "Adagrad", "Adam", "AdamW", "Adamax", "NAdam", "RAdam", "RMSprop"),
-    *("Rprop", "SGD"),
+    *("ASGD", "Adadelta", "Adafactor", "Adagrad", "Adam", "AdamW", "Adamax", "NAdam", "RAdam"),
+    *("RMSprop", "Rprop", "SGD"),
 )
 _LAYERS = ("ELU", "GELU", "Identity", "LeakyReLU", "Linear", "ReLU", "SiLU", "Tanh")
 _SCHEDULES = (
-    *("ConstantLR", "CosineAnnealingLR", "ExponentialLR", "LinearLR", "MultiStepLR"),
-    *("OneCycleLR", "StepLR"),
+    *("ConstantLR", "CosineAnnealingLR", "CosineAnnealingWarmRestarts", "CyclicLR"),
+    *("ExponentialLR", "LinearLR", "MultiStepLR", "OneCycleLR", "PolynomialLR", "StepLR"),
 )
 _RECIPE_NAMES = frozenset(
     {
