@@ -14,6 +14,7 @@ from posefilter.cli import run_command
 from posefilter.cli.build import list_swept, make_trainer, quiet
 from posefilter.cli.evaluate import make_tester
 from posefilter.cli.job import Job
+from posefilter.cli.results import record
 from posefilter.errors import UserError
 
 HOME = Path(__file__).parents[2]
@@ -95,6 +96,24 @@ def test_a_test_on_all_devices_is_refused_where_there_are_several(
     monkeypatch.setattr(CPUAccelerator, "auto_device_count", staticmethod(lambda: 2))
     with pytest.raises(UserError, match=r"^trainer\.devices=auto: evaluate tests in one process"):
         make_tester(settings, [])
+
+
+@pytest.mark.parametrize("strategy", ["ddp_fork", "ddp_notebook", "ddp_spawn"])
+@pytest.mark.parametrize("devices", [1, 2])
+def test_a_strategy_whose_results_end_with_its_processes_is_refused(
+    strategy: str, devices: int
+) -> None:
+    """Lightning then trains in copies of this process, which writes results of no image."""
+    settings = OmegaConf.create({**SETTINGS, "strategy": strategy, "devices": devices})
+    with pytest.raises(UserError, match=rf"^trainer\.strategy={strategy}: .*=ddp_find_unused_\w+"):
+        make_trainer(settings, [])
+
+
+def test_no_results_are_written_of_no_image() -> None:
+    job = Job(OmegaConf.create({}), {}, [], Path(), "train", False)
+    with pytest.raises(UserError, match=r"^no image was tested"):
+        record({"instances": 0, "missed": 0}, job, {}, None)
+    assert record({"instances": 1, "missed": 0}, job, {}, None)["instances"] == 1
 
 
 @pytest.mark.parametrize("precision", ["bf16-mixed", "16-true", "64-true"])

@@ -12,6 +12,7 @@ from hydra.core.override_parser.types import Override
 from lightning import Callback, Trainer
 from lightning.pytorch.loggers import Logger, TensorBoardLogger
 from lightning.pytorch.plugins.environments import SLURMEnvironment
+from lightning.pytorch.strategies.launchers import _MultiProcessingLauncher
 from omegaconf import DictConfig, OmegaConf
 
 from posefilter.callbacks.tensorboard_layout import TensorBoardLayout
@@ -204,8 +205,9 @@ def make_trainer(
     """Build a trainer of its settings.
 
     Raises:
-        UserError: They would blur poses, they have one process of several that were started train
-            alone, or Lightning would test another checkpoint.
+        UserError: They would blur poses, the results would stay in processes that end with the
+            training, they have one process of several that were started train alone, or Lightning
+            would test another checkpoint.
     """
     precision = node.get("precision", "32-true")
     if str(precision) not in ("32-true", "32"):
@@ -226,6 +228,12 @@ def make_trainer(
         enable_progress_bar=False,
     )
     assert isinstance(trainer, Trainer)
+    if isinstance(trainer.strategy.launcher, _MultiProcessingLauncher):
+        raise UserError(
+            f"trainer.strategy={node.get('strategy', 'auto')}: its processes are copies of this "
+            "one, and their results end with them; choose "
+            "trainer.strategy=ddp_find_unused_parameters_true, or auto for one process"
+        )
     if is_follower() and trainer.world_size == 1:
         raise UserError(
             f"trainer.devices={node.get('devices')}: this is one of several processes that srun or "

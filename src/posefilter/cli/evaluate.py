@@ -118,14 +118,14 @@ def _of_checkpoint(job: Job) -> tuple[dict[str, Any], dict[str, Path]]:
     files = {"beliefs": job.folder / "beliefs.npz", "errors": job.folder / ERRORS}
     if absent is not None:
         judge_absent(method, absent)
+    tested = replace(job, choices={**checkpoint["recipe"]["choices"], **chosen(job)})
+    source = Path(job.cfg.checkpoint)
+    found = record(method.collect_results(), tested, data.describe(), source, device)
     native = data.reader.native_from_mesh
     if "pose" in method.capabilities:
         files["poses"] = job.folder / "poses.csv"
         write_poses_csv(files["poses"], to_rows(records.outcomes, data.records("test"), native))
     write_beliefs(files["beliefs"], records.outcomes, data.records("test"), native)
-    tested = replace(job, choices={**checkpoint["recipe"]["choices"], **chosen(job)})
-    source = Path(job.cfg.checkpoint)
-    found = record(method.collect_results(), tested, data.describe(), source, device)
     return found, files
 
 

@@ -10,6 +10,7 @@ import torch
 from posefilter.cli.console import Files, ended, finite, show_table
 from posefilter.cli.job import Job
 from posefilter.cli.machine import device_name, git_state, versions
+from posefilter.errors import UserError
 from posefilter.files import write_whole
 from posefilter.metrics.registry import find_metric, read_number
 
@@ -32,7 +33,16 @@ def record(
     checkpoint: Path | None,
     device: torch.device | None = None,
 ) -> dict[str, Any]:
-    """Return metrics.json: what was found, where, and all that it takes to find it again."""
+    """Return metrics.json: what was found, where, and all that it takes to find it again.
+
+    Raises:
+        UserError: No image was tested.
+    """
+    if not results["instances"]:
+        raise UserError(
+            "no image was tested, so that there are no results to write (did the processes that "
+            "test end with what they found?)"
+        )
     return {
         **results,
         **{group: job.choices.get(group) for group in ("model", "loss", "variant")},
