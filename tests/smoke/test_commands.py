@@ -134,6 +134,15 @@ def test_checkpoints_are_plain_data(trained: Path) -> None:
     assert checkpoint["recipe"]["choices"]["model"] == "pose_pf"
 
 
+def test_a_share_of_no_batch_is_refused_before_it_is_evaluated(
+    trained: Path, tmp_path: Path, tiny_scenes: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    words = [f"checkpoint={trained}", f"data.root={tiny_scenes}", "+trainer.limit_test_batches=0.1"]
+    assert run_command("evaluate", HOME, [*words, "console=json", f"out={tmp_path / 'a'}"]) == 2
+    said = capfd.readouterr().err
+    assert "evaluate: trainer.limit_test_batches=0.1: of 1 batches this is none" in said
+
+
 def test_evaluate_finds_what_the_training_found_and_so_do_its_own_estimates(
     trained: Path, tmp_path: Path, tiny_scenes: Path
 ) -> None:

@@ -25,6 +25,7 @@ from posefilter.cli.plain import key_of, resolve
 from posefilter.cli.progress_bar import progress
 from posefilter.cli.ranks import is_follower
 from posefilter.cli.stopping import FinalValidation, Stop
+from posefilter.data.loaders import count_batches
 from posefilter.data.module import PoseDataModule
 from posefilter.devices import choose_device
 from posefilter.errors import UserError
@@ -242,6 +243,19 @@ def make_trainer(
         )
     _keep_from_requeueing(trainer)
     return trainer
+
+
+def check_share(trainer: Trainer, data: PoseDataModule, split: str) -> None:
+    """Refuse a share of the batches of "train" or "test" that is none of them."""
+    share = getattr(trainer, f"limit_{split}_batches")
+    if not (isinstance(share, float) and share < 1):
+        return
+    there = len(getattr(data, f"{split}_dataloader")())
+    if not count_batches(there, share):
+        why = {"train": "there would be no step", "test": "nothing would be tested"}[split]
+        raise UserError(
+            f"trainer.limit_{split}_batches={share}: of {there} batches this is none, and {why}"
+        )
 
 
 def _keep_from_requeueing(trainer: Trainer) -> None:

@@ -15,7 +15,7 @@ from omegaconf import DictConfig, OmegaConf
 from posefilter.callbacks.errors import ErrorTable, make_rows
 from posefilter.callbacks.records import Records, to_rows, write_beliefs
 from posefilter.cli.bop_scores import assign_estimates, score_targets, sort_rows
-from posefilter.cli.build import build_data, make_trainer, quiet
+from posefilter.cli.build import build_data, check_share, make_trainer, quiet
 from posefilter.cli.checkpoints import method_of, read_checkpoint
 from posefilter.cli.components import changed, changes, chosen
 from posefilter.cli.console import typed, warn
@@ -110,6 +110,7 @@ def _of_checkpoint(job: Job) -> tuple[dict[str, Any], dict[str, Path]]:
     trainer = make_tester(job.cfg.trainer, callbacks)
     if trainer.limit_test_batches == 0:
         raise UserError("trainer.limit_test_batches=0: leaves nothing to test")
+    check_share(trainer, data, "test")
     device = trainer.strategy.root_device
     # broken files are refused before anything is tested
     absent = open_absent(method, data, job.cfg.absent_frames, job.cfg.console)

@@ -16,7 +16,7 @@ from torch.utils.data import default_collate
 
 from posefilter.callbacks.tensorboard import get_boards
 from posefilter.cli.best import check_kept
-from posefilter.cli.build import build_data, build_trainer
+from posefilter.cli.build import build_data, build_trainer, check_share
 from posefilter.cli.checkpoints import build_method, method_of, read_checkpoint, recipe
 from posefilter.cli.console import is_installed, say, setting, typed
 from posefilter.cli.folders import move_evaluation, own_metrics
@@ -200,8 +200,8 @@ def check_validated(run: Run) -> None:
     for name, what in needed.items():
         if getattr(trainer, name) == 0:
             raise UserError(f"trainer.{name}=0: a training needs {what}")
-    _check_share(run, "train")
-    _check_share(run, "test")
+    check_share(trainer, run.data, "train")
+    check_share(trainer, run.data, "test")
     _check_epochs(trainer)
     if every is None or trainer.max_steps < 0:
         return
@@ -213,19 +213,6 @@ def check_validated(run: Run) -> None:
             f"trainer.check_val_every_n_epoch={every}: an epoch has {batches} batches, so that the "
             f"first validation is after step {step}, and trainer.max_steps={trainer.max_steps}; "
             "null counts trainer.val_check_interval in steps"
-        )
-
-
-def _check_share(run: Run, split: str) -> None:
-    """Refuse a share of a split's batches that is none of them."""
-    share = getattr(run.trainer, f"limit_{split}_batches")
-    if not (isinstance(share, float) and share < 1):
-        return
-    there = len(getattr(run.data, f"{split}_dataloader")())
-    if not count_batches(there, share):
-        why = {"train": "there would be no step", "test": "a training ends with its test"}[split]
-        raise UserError(
-            f"trainer.limit_{split}_batches={share}: of {there} batches this is none, and {why}"
         )
 
 
