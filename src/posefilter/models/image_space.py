@@ -3,8 +3,7 @@ it.
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 import torch
 import torch.nn.functional as F
@@ -26,8 +25,7 @@ from posefilter.nets.heads import fill_depth
 from posefilter.types import Batch, ObjectModel, ParticleOutput, Particles, Step, Trace
 
 
-@dataclass(frozen=True)
-class ImageEncoding:
+class ImageEncoding(NamedTuple):
     """B encoded images."""
 
     image: Tensor  # (B, 4, H, W): color in [-1, 1], depth [m]

@@ -1,0 +1,74 @@
+"""What is built in Python, in a Trainer of the caller's own."""
+
+import pickle
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from lightning import Trainer
+from tests.smoke.conftest import SMALL_POSE_PF, TINY
+
+import posefilter
+from posefilter.cli.choices import list_choices
+from posefilter.data.module import PoseDataModule
+from posefilter.models.base import PoseEstimator
+from posefilter.paths import find_conf
+from posefilter.types import Trace
+
+Pair = tuple[PoseEstimator, PoseDataModule]
+
+
+@pytest.fixture(scope="module")
+def pair(tiny_scenes: Path) -> Callable[[str], Pair]:
+    """Return a function that builds a method of a name, and the data that it learns.
+
+    The object's halves are parts, which one method needs.
+    """
+
+    def build(model: str) -> Pair:
+        words = [f"model={model}", f"data.root={tiny_scenes}", "data.limit_test=2", *TINY]
+        config = posefilter.compose([*words, *(SMALL_POSE_PF if model == "pose_pf" else [])])
+        data = posefilter.build_data(config)
+        data.prepare_data()
+        data.setup("fit")
+        whole = data.object_to_learn()
+        left = whole.points[:, 0] < whole.center[0]
+        parts = {"left": whole.points[left], "right": whole.points[~left]}
+        method = posefilter.build(config)
+        method.set_object(whole._replace(parts=parts))
+        return method, data
+
+    return build
+
+
+def make_trainer(folder: Path, **settings: Any) -> Trainer:
+    return Trainer(
+        default_root_dir=folder,
+        logger=False,
+        accelerator="cpu",
+        enable_progress_bar=False,
+        enable_model_summary=False,
+        **settings,
+    )
+
+
+@pytest.mark.parametrize("model", list_choices(find_conf() / "model"))
+def test_a_trainer_predicts(model: str, pair: Callable[[str], Pair], tmp_path: Path) -> None:
+    """It moves what each method found to the CPU, whatever that is made of."""
+    found = make_trainer(tmp_path).predict(*pair(model))
+    assert found is not None
+    assert all(isinstance(one, Trace) for one in found)
+    assert sum(len(one.belief.best) for one in found) == 2  # type: ignore[union-attr]
+
+
+def test_what_a_trainer_has_trained_is_pickled(pair: Callable[[str], Pair], tmp_path: Path) -> None:
+    """With the data, which know the trainer, and all that it has made."""
+    method, data = pair("cnn_patch")
+    make_trainer(tmp_path, max_steps=1, limit_val_batches=1).fit(method, data)
+    again = pickle.loads(pickle.dumps(data))
+    assert again.split_record() == data.split_record()
+    assert type(again.trainer.lightning_module) is type(method)
+    weights = again.trainer.lightning_module.state_dict()
+    assert all(torch.equal(value, weights[key]) for key, value in method.state_dict().items())
