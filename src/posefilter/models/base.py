@@ -537,5 +537,19 @@ def with_lightning(kind: type[PoseEstimator]) -> type[PoseEstimator]:
 
     if issubclass(kind, LightningModule):
         return kind
+
+    def reduce(method: Any, protocol: Any) -> Any:
+        """Pickle by the class without Lightning: by this one's name that one is found."""
+        if type(method) is not made:  # a class of one's own made of this one
+            return object.__reduce_ex__(method, protocol)
+        return _make_empty, (kind,), method.__getstate__()
+
     same = {name: getattr(kind, name) for name in ("__module__", "__qualname__", "__doc__")}
-    return type(kind.__name__, (kind, LightningModule), same)
+    made = type(kind.__name__, (kind, LightningModule), {**same, "__reduce_ex__": reduce})
+    return made
+
+
+def _make_empty(kind: Any) -> PoseEstimator:
+    """Return a LightningModule of a method's class, as yet without any attribute."""
+    made = with_lightning(kind)
+    return made.__new__(made)

@@ -3,6 +3,7 @@
 import inspect
 import math
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 from torch.optim import Optimizer
@@ -68,11 +69,15 @@ def warmup_cosine(
         min_lr_fraction: Last learning rate, as a fraction of the peak.
     """
     rise = max(1, min(warmup_steps, steps // 10))
+    return LambdaLR(optimizer, partial(_find_factor, steps, rise, min_lr_fraction))
 
-    def factor(step: int) -> float:
-        if step < rise:
-            return (step + 1) / rise
-        done = min(1.0, (step - rise) / max(1, steps - rise))
-        return min_lr_fraction + (1 - min_lr_fraction) * 0.5 * (1 + math.cos(math.pi * done))
 
-    return LambdaLR(optimizer, factor)
+def _find_factor(steps: int, rise: int, least: float, step: int) -> float:
+    """Return the learning rate at a step, as a fraction of the peak.
+
+    At the top of the module, so that a trainer can be pickled.
+    """
+    if step < rise:
+        return (step + 1) / rise
+    done = min(1.0, (step - rise) / max(1, steps - rise))
+    return least + (1 - least) * 0.5 * (1 + math.cos(math.pi * done))
