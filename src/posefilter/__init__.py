@@ -20,7 +20,7 @@ __version__ = "0.1.0"
 
 if TYPE_CHECKING:
     from posefilter import figures
-    from posefilter.api import build, build_data, compose, load
+    from posefilter.api import build, build_data, compose, load, load_method
     from posefilter.belief import Belief, Mode, PoseSet
     from posefilter.cli.trust import trust
     from posefilter.confidence.tolerance import PoseTolerance
@@ -51,6 +51,7 @@ __all__ = [
     "compose",
     "figures",
     "load",
+    "load_method",
     "trust",
     "undistort",
 ]
@@ -72,6 +73,7 @@ _HOMES = {
     "compose": "api",
     "figures": "figures",
     "load": "api",
+    "load_method": "api",
     "trust": "cli.trust",
     "undistort": "geometry.lens",
 }

@@ -8,7 +8,13 @@ from typing import TYPE_CHECKING, Any
 import torch
 from omegaconf import DictConfig
 
-from posefilter.cli.checkpoints import build_method, methods_of, recipe
+from posefilter.cli.checkpoints import (
+    build_method,
+    method_of,
+    methods_of,
+    read_checkpoint,
+    recipe,
+)
 from posefilter.cli.components import SECTIONS, changes
 from posefilter.cli.job import Job
 from posefilter.cli.plain import key_of
@@ -72,6 +78,30 @@ def load(
     wanted = changes(compose(overrides, "predict")) if overrides else {}
     take_threads()
     return Estimator(methods_of(weights, wanted), device, costs, pose_tolerance)
+
+
+def load_method(weights: str | Path) -> PoseEstimator:
+    """Load a trained method as a LightningModule, for a trainer of your own: one, too, that detects
+    and estimates no pose.
+
+    ```python
+    method = posefilter.load_method("outputs/runs/carton")
+    lightning.Trainer(max_steps=100).fit(method.train(), data)
+    ```
+
+    A checkpoint is data, as for `load`.
+
+    Args:
+        weights: A checkpoint, one that Lightning wrote of what `build` returns, too; a run's
+            folder; or the name of weights that ship with posefilter.
+
+    Returns:
+        The method with its object, in evaluation mode.
+
+    Raises:
+        UserError: A file is missing or holds no checkpoint with a recipe.
+    """
+    return method_of(read_checkpoint(weights))
 
 
 def _list_overrides(overrides: Iterable[str], example: str) -> list[str]:

@@ -454,7 +454,7 @@ def test_every_public_name_is_documented() -> None:
     for name in posefilter.__all__:
         thing = getattr(posefilter, name)
         assert isinstance(thing, str) or len(thing.__doc__ or "") > 40, name
-    for name in ("load", "compose", "build"):
+    for name in ("load", "load_method", "compose", "build"):
         assert "Raises:" in getattr(posefilter, name).__doc__
 
 

@@ -72,3 +72,22 @@ def test_what_a_trainer_has_trained_is_pickled(pair: Callable[[str], Pair], tmp_
     assert type(again.trainer.lightning_module) is type(method)
     weights = again.trainer.lightning_module.state_dict()
     assert all(torch.equal(value, weights[key]) for key, value in method.state_dict().items())
+
+
+def test_a_method_that_detects_is_read_back(pair: Callable[[str], Pair], tmp_path: Path) -> None:
+    """Of what a trainer of one's own has written; its class alone does not know its settings."""
+    method, data = pair("cnn_patch")
+    trainer = make_trainer(tmp_path, max_steps=1, limit_val_batches=1)
+    trainer.fit(method, data)
+    file = tmp_path / "own.ckpt"
+    trainer.save_checkpoint(file, weights_only=False)
+    again = posefilter.load_method(file)
+    assert type(again) is type(method)
+    assert again.object_model.name == "carton"
+    weights = again.state_dict()
+    assert all(torch.equal(value, weights[key]) for key, value in method.state_dict().items())
+    with pytest.raises(posefilter.UserError, match=r"own\.ckpt: .*posefilter\.load_method"):
+        type(method).load_from_checkpoint(file, weights_only=True)
+    trainer = make_trainer(tmp_path / "more", max_steps=2, limit_val_batches=1)
+    trainer.fit(again.train(), data, ckpt_path=file, weights_only=True)
+    assert trainer.global_step == 2

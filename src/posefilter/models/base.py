@@ -544,8 +544,19 @@ def with_lightning(kind: type[PoseEstimator]) -> type[PoseEstimator]:
             return object.__reduce_ex__(method, protocol)
         return _make_empty, (kind,), method.__getstate__()
 
-    same = {name: getattr(kind, name) for name in ("__module__", "__qualname__", "__doc__")}
-    made = type(kind.__name__, (kind, LightningModule), {**same, "__reduce_ex__": reduce})
+    def load(cls: Any, checkpoint_path: Any, *args: Any, **kwargs: Any) -> Any:
+        """Load as Lightning does: the settings have to be given."""
+        try:
+            return super(made, cls).load_from_checkpoint(checkpoint_path, *args, **kwargs)
+        except TypeError as error:
+            raise UserError(
+                f"{checkpoint_path}: load_from_checkpoint needs all settings of {cls.__name__}; "
+                "posefilter.load_method(path) takes them from the checkpoint"
+            ) from error
+
+    own = {name: getattr(kind, name) for name in ("__module__", "__qualname__", "__doc__")}
+    own |= {"__reduce_ex__": reduce, "load_from_checkpoint": classmethod(load)}
+    made: Any = type(kind.__name__, (kind, LightningModule), own)
     return made
 
 
