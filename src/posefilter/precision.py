@@ -8,6 +8,7 @@ import torch
 
 from posefilter.errors import UserError
 
+_FULL = ("32-true", "32")
 _P = ParamSpec("_P")
 _R = TypeVar("_R")
 
@@ -32,3 +33,13 @@ def in_float32(function: Callable[_P, _R]) -> Callable[_P, _R]:
             return function(*args, **kwargs)
 
     return checked
+
+
+def check_precision(precision: object) -> None:
+    """Raise UserError for a trainer's precision that would blur poses, or fit no network."""
+    if str(precision) not in _FULL:
+        raise UserError(
+            f"trainer.precision={precision}: half precision costs a pose millimeters, and double "
+            "slows all down; leave it at 32-true (networks take bfloat16 by themselves where that "
+            "is fast and safe)"
+        )

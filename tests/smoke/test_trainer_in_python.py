@@ -91,3 +91,15 @@ def test_a_method_that_detects_is_read_back(pair: Callable[[str], Pair], tmp_pat
     trainer = make_trainer(tmp_path / "more", max_steps=2, limit_val_batches=1)
     trainer.fit(again.train(), data, ckpt_path=file, weights_only=True)
     assert trainer.global_step == 2
+
+
+@pytest.mark.parametrize("precision", ["bf16-mixed", "64-true"])
+def test_a_precision_that_blurs_poses_is_refused_in_python_too(
+    precision: Any, pair: Callable[[str], Pair], tmp_path: Path
+) -> None:
+    trainer = make_trainer(tmp_path, max_steps=1, precision=precision)
+    for run in (trainer.fit, trainer.validate, trainer.test, trainer.predict):
+        with pytest.raises(
+            posefilter.UserError, match=rf"^trainer\.precision={precision}: .*32-tr"
+        ):
+            run(*pair("cnn_patch"))

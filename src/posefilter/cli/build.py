@@ -29,6 +29,7 @@ from posefilter.data.loaders import count_batches
 from posefilter.data.module import PoseDataModule
 from posefilter.devices import choose_device
 from posefilter.errors import UserError
+from posefilter.precision import check_precision
 
 log = logging.getLogger(__name__)
 
@@ -210,13 +211,7 @@ def make_trainer(
             training, they have one process of several that were started train alone, or Lightning
             would test another checkpoint.
     """
-    precision = node.get("precision", "32-true")
-    if str(precision) not in ("32-true", "32"):
-        raise UserError(
-            f"trainer.precision={precision}: half precision costs a pose millimeters, and double "
-            "slows all down; leave it at 32-true (networks take bfloat16 by themselves where that "
-            "is fast and safe)"
-        )
+    check_precision(node.get("precision", "32-true"))
     if node.get("accelerator") == "auto":  # Lightning's takes what has no float64, too
         node = node.copy()
         node.accelerator = choose_device()

@@ -41,6 +41,7 @@ from posefilter.models.lr_schedulers import find_length, start_schedule
 from posefilter.models.quantization import unpack_object
 from posefilter.models.zoom import check_zoom, choose_part, search
 from posefilter.nets import folded, fused
+from posefilter.precision import check_precision
 from posefilter.protocols import Loss, ScoresPoses, Space
 from posefilter.types import Batch, BeliefBatch, ObjectModel, ParticleOutput, Particles, Step, Trace
 
@@ -335,6 +336,10 @@ class PoseEstimator(Module):
         return calibrate_belief(belief, right, standardized, scale, self.object_model, widening)
 
     # -- training ----------------------------------------------------------------------------------
+
+    def setup(self, stage: str) -> None:
+        """Refuse a trainer of another precision, before anything is computed."""
+        check_precision(self.trainer.precision)
 
     def training_step(self, batch: Batch, batch_number: int) -> Tensor:
         """Return the sum of the losses' means, the loss that is minimized.
