@@ -53,6 +53,27 @@ def test_a_folder_with_results_is_refused_before_anything_is_written(
     assert contents(run) == before
 
 
+@pytest.mark.parametrize(
+    ("command", "arguments"),
+    [("train", []), ("train", ["-m", "seed=1,2"]), ("generate", []), ("predict", ["checkpoint=x"])],
+    ids=["train", "a sweep", "generate", "predict"],
+)
+def test_a_run_does_not_move_to_its_own_folder(
+    command: str,
+    arguments: list[str],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capfd: pytest.CaptureFixture[str],
+) -> None:
+    """Each path that was typed would be looked for there."""
+    monkeypatch.chdir(tmp_path)
+    words = [*arguments, "hydra.job.chdir=true", "out=run", "console=json"]
+    assert run_command(command, HOME, words) == 2
+    (line,) = capfd.readouterr().err.splitlines()
+    assert line.startswith(f"{command}: hydra.job.chdir=True: paths are relative to the folder")
+    assert [*tmp_path.iterdir()] == []
+
+
 def test_advice_on_a_folder_with_a_blank_can_be_typed(
     tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:

@@ -1,6 +1,7 @@
 """Folders that commands write to: what is in them is not overwritten, and none is left empty."""
 
 import json
+import os
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -36,11 +37,13 @@ class KeepResults(Callback):
         """Check a run's folder."""
         HydraConfig.instance().set_config(config)  # which the folder's name refers to
         with passing_hydra():
+            check_place(config.hydra)
             self._check_run(config)
 
     def on_multirun_start(self, config: DictConfig, **kwargs: Any) -> None:
         """Check a sweep's folder: an earlier start of the sweep is resumed."""
         with passing_hydra():
+            check_place(config.hydra)
             check_out(config)
             folder = Path(config.hydra.sweep.dir)
             if holds_run(folder):
@@ -73,6 +76,20 @@ def passing_hydra() -> Iterator[None]:
         yield
     except (UserError, OmegaConfBaseException, OSError) as error:
         raise Carrier(error) from error
+
+
+def check_place(hydra: Any) -> None:
+    """Refuse to work in the run's own folder, where paths that were typed would be looked for.
+
+    Raises:
+        UserError: Hydra's settings ask for it; the working folder is again that of the command.
+    """
+    if hydra.job.chdir:
+        os.chdir(hydra.runtime.cwd)
+        raise UserError(
+            f"hydra.job.chdir={hydra.job.chdir}: paths are relative to the folder in which the "
+            "command is typed; leave it out, and choose the run's folder by out="
+        )
 
 
 def refuse(folder: Path, what: str) -> None:

@@ -19,6 +19,7 @@ from posefilter.cli.console import JSON, say, settle_logging
 from posefilter.cli.explain import first_line
 from posefilter.cli.fit import check_fit
 from posefilter.cli.folders import (
+    check_place,
     forget_failure,
     hold_folder,
     note_failure,
@@ -59,6 +60,7 @@ def run_job(cfg: DictConfig, name: str, begun: list[Job], kept: list[Job]) -> An
     except EXPECTED as error:  # a setting refers to nothing
         raise Carrier(error) from error
     try:
+        check_place(HydraConfig.get())
         check_settings(cfg, name, job.choices)
         if name in _OWN_FOLDER:
             hold_folder(job.folder)
