@@ -273,7 +273,8 @@ def _keep_from_requeueing(trainer: Trainer) -> None:
 
 def quiet() -> None:
     """Silence advice that does not apply here."""
-    logging.getLogger("lightning.pytorch.utilities.rank_zero").setLevel(logging.WARNING)
+    for name in ("pytorch.utilities.rank_zero", "fabric.utilities.distributed"):
+        logging.getLogger(f"lightning.{name}").setLevel(logging.WARNING)
     for text in (
         ".*does not have many workers.*",
         ".*LeafSpec.*",

@@ -131,6 +131,7 @@ def finite(content: Any) -> Any:
 
 def settle_logging(console: str) -> None:
     """Have the log's lines on the console be sentences; for machines, on stderr, and only warnings.
+    Of several processes, all but the first one say warnings alone.
 
     Files keep all.
     """
@@ -138,6 +139,7 @@ def settle_logging(console: str) -> None:
         if type(handler) is logging.StreamHandler:
             if console == JSON:
                 handler.setStream(sys.stderr)
+            if console == JSON or is_follower():
                 handler.setLevel(logging.WARNING)
             handler.setFormatter(logging.Formatter("%(message)s"))
 
