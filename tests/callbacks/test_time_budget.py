@@ -95,7 +95,9 @@ def test_a_fast_machine_sees_the_schedule_as_it_is(
 def test_a_slow_machine_ends_on_time_with_the_rate_decayed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    line = run(tmp_path, monkeypatch, 20, TimeBudget(8.0))
+    budget = TimeBudget(8.0)
+    line = run(tmp_path, monkeypatch, 20, budget)
+    assert budget.ended
     assert len(line.rates) == 8
     assert line.rates[-1] < 0.1
     assert line.rates[1:] == sorted(line.rates[1:], reverse=True)

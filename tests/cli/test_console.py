@@ -14,8 +14,10 @@ import torch
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from rich.progress import Progress
 
+from posefilter.callbacks.time_budget import TimeBudget
 from posefilter.cli.console import ended, logging_for, say, show_table, typed
 from posefilter.cli.progress_bar import Bars, Lines, briefly, format_metrics, progress
+from posefilter.cli.train import say_ended
 from posefilter.progress import bars, watched
 
 METRICS = {
@@ -184,6 +186,36 @@ def test_a_training_by_epochs_or_by_the_clock_has_no_steps_below_zero(
     lines.on_train_start(trainer, module)  # type: ignore[arg-type]
     lines.on_validation_end(trainer, module)  # type: ignore[arg-type]
     assert capsys.readouterr().out.startswith(told)
+
+
+@pytest.mark.parametrize(
+    ("step", "steps", "is_budget_up", "said"),
+    [
+        (2, 5, None, "ended at step 2 of 5, by a callback or trainer.max_time\n"),
+        (2, 5, False, "ended at step 2 of 5, by a callback or trainer.max_time\n"),
+        (2, 5, True, ""),
+        (5, 5, None, ""),
+        (2, math.inf, None, ""),  # whose end is no step
+    ],
+)
+def test_a_training_that_ends_early_says_so(
+    step: int,
+    steps: float,
+    is_budget_up: bool | None,
+    said: str,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """Unless by its time budget, as it was asked to."""
+    callbacks = [] if is_budget_up is None else [TimeBudget(9.0)]
+    for budget in callbacks:
+        budget.ended = bool(is_budget_up)
+    trainer = SimpleNamespace(
+        global_step=step, estimated_stepping_batches=steps, callbacks=callbacks
+    )
+    job = SimpleNamespace(cfg=SimpleNamespace(console="rich"))
+    run: Any = SimpleNamespace(trainer=trainer, job=job)
+    say_ended(run)
+    assert capsys.readouterr().out == said
 
 
 def test_the_end_says_where_and_what_next(capsys: pytest.CaptureFixture[str]) -> None:

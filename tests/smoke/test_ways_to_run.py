@@ -97,6 +97,19 @@ def test_a_search_maximizes_the_score(tiny_scenes: Path, tmp_path: Path) -> None
 
 
 @pytest.mark.slow
+def test_a_callback_that_ends_a_training_is_noticed(
+    tiny_scenes: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    stopping = "{_target_: lightning.pytorch.callbacks.EarlyStopping, monitor: val/score, mode: max"
+    typed = [*TINY, "model=cnn_patch", f"data.root={tiny_scenes}", f"out={tmp_path}"]
+    typed += ["callbacks=checkpoints", f"+callbacks.stop={stopping}, stopping_threshold: -1}}"]
+    assert run_command("train", HOME, typed) == 0
+    events = [json.loads(line) for line in capfd.readouterr().out.splitlines()]
+    told = next(event for event in events if event["event"] == "ended")
+    assert told == {"event": "ended", "step": 4, "steps": 8}
+
+
+@pytest.mark.slow
 def test_a_callback_that_waits_for_no_metric_of_ours_is_one_line(
     tiny_scenes: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:

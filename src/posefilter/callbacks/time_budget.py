@@ -36,6 +36,7 @@ class TimeBudget(Callback):
             raise UserError(f"time budget by the clock {clock}: choose {' or '.join(_CLOCKS)}")
         self.seconds, self.clock = seconds, clock
         self.spent = 0.0  # in earlier sittings [s]
+        self.ended = False  # whether its time is up, or the schedule's
         self._began = self.now()
 
     def now(self) -> float:
@@ -66,11 +67,11 @@ class TimeBudget(Callback):
         if trainer.world_size > 1:  # their clocks differ, and their weights must not
             share = trainer.strategy.broadcast(share)
         pl_module.time_spent = share
-        ended = share == 1
+        self.ended = share == 1
         for config in trainer.lr_scheduler_configs:
             scheduler: Any = config.scheduler
             while scheduler.last_epoch < int(share * trainer.max_steps):
                 scheduler.step()
-            ended |= 0 < trainer.max_steps <= scheduler.last_epoch
-        if ended:
+            self.ended |= 0 < trainer.max_steps <= scheduler.last_epoch
+        if self.ended:
             trainer.should_stop = True

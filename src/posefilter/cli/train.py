@@ -15,6 +15,7 @@ from lightning.pytorch import callbacks, loops
 from torch.utils.data import default_collate
 
 from posefilter.callbacks.tensorboard import get_boards
+from posefilter.callbacks.time_budget import TimeBudget
 from posefilter.cli.best import check_kept
 from posefilter.cli.build import build_data, build_trainer, check_share
 from posefilter.cli.checkpoints import build_method, method_of, read_checkpoint, recipe
@@ -23,6 +24,7 @@ from posefilter.cli.folders import move_evaluation, own_metrics
 from posefilter.cli.job import Job
 from posefilter.cli.learned import DATA, list_learned
 from posefilter.cli.machine import settle
+from posefilter.cli.progress_bar import count_steps
 from posefilter.cli.ranks import is_follower
 from posefilter.cli.recipe import check_recipe
 from posefilter.cli.results import record, show, write_json
@@ -177,6 +179,7 @@ def fit(run: Run) -> dict[str, Any]:
         if not isinstance(error, MisconfigurationException) and not _raised_by_lightning(error):
             raise
         raise UserError(f"trainer or callbacks: {told}") from error
+    say_ended(run)
     taken = cost(run.trainer.global_step, before, *began)
     if run.trainer.global_step == before:  # resumed at its end: what was measured stays
         taken |= {k: v for k, v in known.items() if k in taken and taken[k] is None}
@@ -318,6 +321,16 @@ def cost(steps: int, before: int, wall: float, cpu: float) -> dict[str, float | 
     each = (time.perf_counter() - wall, time.process_time() - cpu)
     seconds, cpu_seconds = (spent / done if done > 0 else None for spent in each)
     return {"steps": steps, "seconds_per_step": seconds, "cpu_seconds_per_step": cpu_seconds}
+
+
+def say_ended(run: Run) -> None:
+    """Say where a training ended before its last step, unless its time budget was up."""
+    step, steps = run.trainer.global_step, count_steps(run.trainer)
+    budgets = (one for one in run.trainer.callbacks if isinstance(one, TimeBudget))  # type: ignore[attr-defined]
+    if steps is None or step >= steps or any(one.ended for one in budgets):
+        return
+    sentence = f"ended at step {step} of {steps}, by a callback or trainer.max_time"
+    say(run.job.cfg.console, "ended", sentence, step=step, steps=steps)
 
 
 def say_stopped(run: Run) -> None:
