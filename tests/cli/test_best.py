@@ -10,6 +10,7 @@ from typing import Any, ClassVar
 import pytest
 import torch
 from lightning import Callback, LightningModule, Trainer
+from lightning.pytorch.callbacks import EarlyStopping
 from torch import Tensor, nn
 from torch.utils.data import DataLoader
 
@@ -195,6 +196,30 @@ def test_a_run_whose_best_checkpoint_would_not_be_found_is_refused_before_it(
         check_kept([last], tmp_path)
     with pytest.raises(UserError, match=r"callbacks\.last\.dirpath"):
         check_kept([Last(str(tmp_path)), Best(**right)], tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("monitor", "mode", "better"),
+    [
+        ("val/score", "min", "max"),  # min is Lightning's default
+        ("val/score", "max", None),
+        ("val/add/median_mm", "max", "min"),
+        ("val/add/median_mm", "min", None),
+        ("val/of_a_plugin", "min", None),
+    ],
+)
+def test_a_training_does_not_end_because_it_gets_better(
+    monitor: str, mode: str, better: str | None, tmp_path: Path
+) -> None:
+    folder = tmp_path / "checkpoints"
+    best = Best(dirpath=folder, filename="best", monitor="val/score", mode="max")
+    callbacks = [best, EarlyStopping(monitor, mode=mode)]
+    if better is None:
+        check_kept(callbacks, tmp_path)
+        return
+    told = rf"EarlyStopping>\.mode={mode}: would end .* better {monitor}; must be {better}$"
+    with pytest.raises(UserError, match=told):
+        check_kept(callbacks, tmp_path)
 
 
 def test_saving_says_nothing(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from lightning import Callback, LightningModule, Trainer
-from lightning.pytorch.callbacks import Checkpoint, ModelCheckpoint
+from lightning.pytorch.callbacks import Checkpoint, EarlyStopping, ModelCheckpoint
 from torch import Tensor
 
 from posefilter.cli.resume import BEFORE, LAST
@@ -156,7 +156,7 @@ class Last(Checkpoint):
 
 def check_kept(callbacks: Sequence[Callback], folder: Path) -> None:
     """Refuse settings by which a run's checkpoints would not be where its test, `resume=` and
-    reports look for them: now, not after the training.
+    reports look for them, or it would end while it gets better: now, not after the training.
 
     Raises:
         UserError: The key, and what it has to be.
@@ -182,12 +182,18 @@ def check_kept(callbacks: Sequence[Callback], folder: Path) -> None:
                 f"callbacks.best.monitor={one.monitor}: must be a number of the validation, such "
                 "as val/score"
             )
-        better = _find_mode(str(one.monitor))
-        if better not in (None, one.mode):
-            raise UserError(
-                f"callbacks.best.mode={one.mode}: would keep the worst {one.monitor}; must be "
-                f"{better}"
-            )
+        _check_mode(f"callbacks.best.mode={one.mode}", one, "would keep the worst")
+    for stop in callbacks:
+        if isinstance(stop, EarlyStopping):
+            key = f"callbacks.<{type(stop).__name__}>.mode={stop.mode}"
+            _check_mode(key, stop, "would end the training for a better")
+
+
+def _check_mode(setting: str, callback: Best | EarlyStopping, what: str) -> None:
+    """Raise UserError where a callback takes the worse of a number for the better."""
+    better = _find_mode(str(callback.monitor))
+    if better not in (None, callback.mode):
+        raise UserError(f"{setting}: {what} {callback.monitor}; must be {better}")
 
 
 def _find_mode(monitor: str) -> str | None:
