@@ -4,6 +4,7 @@ from pathlib import Path
 
 import pytest
 from hydra.core.override_parser.overrides_parser import OverridesParser
+from omegaconf import OmegaConf
 
 from posefilter.cli import run_command
 from posefilter.cli.arguments import (
@@ -16,6 +17,7 @@ from posefilter.cli.arguments import (
     told_apart,
     with_home,
 )
+from posefilter.cli.build import make_trainer
 from posefilter.cli.choices import check_added, check_choices
 from posefilter.cli.command import compose_config
 from posefilter.cli.explain import near
@@ -64,6 +66,50 @@ def test_a_setting_in_the_wrong_place_is_told_its_place(
 ) -> None:
     assert run_command("train", HOME, [typed]) == 2
     assert told in capfd.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("command", "typed", "told"),
+    [
+        ("train", "ckpt_path=a/last.ckpt", "type resume=RUN to go on with a run, or warm_start="),
+        ("evaluate", "ckpt_path=a/best.ckpt", "type checkpoint=RUN"),
+        ("train", "train=False", "a checkpoint is tested by evaluate"),
+        ("train", "test=False", "a training ends with a test of its best checkpoint"),
+        ("train", "hparams_search=mnist_optuna", "type -m hydra/sweeper=optuna"),
+    ],
+)
+def test_a_setting_of_others_programs_is_told_what_is_typed_here(
+    command: str, typed: str, told: str, capfd: pytest.CaptureFixture[str]
+) -> None:
+    assert run_command(command, HOME, [typed]) == 2
+    key = typed.partition("=")[0]
+    assert f"{command}: {key}: there is no such setting; {told}" in capfd.readouterr().err
+
+
+@pytest.mark.parametrize("sign", ["", "+"])
+@pytest.mark.parametrize(
+    ("setting", "told"),
+    [
+        ("enable_progress_bar=false", "console=json shows no bar"),
+        ("callbacks=x", "type +callbacks.NAME._target_=CLASS"),
+        ("logger=x", "type logger=NAME"),
+        ("plugins=x", "leave it out"),
+    ],
+)
+def test_what_a_trainer_is_given_is_told_what_is_typed_for_it(
+    sign: str, setting: str, told: str, capfd: pytest.CaptureFixture[str]
+) -> None:
+    typed = f"trainer.{setting}"
+    if sign:
+        settings = OmegaConf.from_dotlist([typed, "trainer._target_=lightning.Trainer"])
+        with pytest.raises(UserError) as refusal:
+            make_trainer(settings.trainer, [])
+        said = str(refusal.value)
+    else:
+        assert run_command("train", HOME, [typed]) == 2
+        said = capfd.readouterr().err
+    key = typed.partition("=")[0]
+    assert f"{key}: is not a setting; the program gives it itself; {told}" in said
 
 
 def test_of_many_settings_of_one_name_those_are_told_that_are_typed_alike() -> None:

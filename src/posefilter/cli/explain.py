@@ -19,7 +19,7 @@ from yaml import MarkedYAMLError
 
 from posefilter.cli.arguments import quote
 from posefilter.cli.choices import config_folders, list_choices, say_no_choice
-from posefilter.cli.instantiate import hint
+from posefilter.cli.instantiate import GIVEN, hint, tell_given
 from posefilter.cli.plain import key_of, to_plain
 from posefilter.cli.renamed import rename_argument, rename_missing
 from posefilter.errors import find_reason
@@ -35,6 +35,20 @@ LIGHTNINGS = (
     *("overfit_batches", "precision", "profiler", "reload_dataloaders_every_n_epochs", "strategy"),
     *("sync_batchnorm", "use_distributed_sampler", "val_check_interval"),
 )
+# settings of others' programs that train with Lightning and Hydra, and what is typed here
+_CHECKPOINT = "type checkpoint=RUN"
+_TEMPLATES = {
+    "train": {
+        "ckpt_path": "type resume=RUN to go on with a run, or warm_start=FILE for its weights",
+        "hparams_search": "type -m hydra/sweeper=optuna, and what is to be searched",
+        "task_name": "type tags=[NAME], or out=DIR",
+        "test": "a training ends with a test of its best checkpoint",
+        "train": "a checkpoint is tested by evaluate",
+    },
+    "evaluate": {"ckpt_path": _CHECKPOINT},
+    "predict": {"ckpt_path": _CHECKPOINT},
+    "track": {"ckpt_path": _CHECKPOINT},
+}
 _FORMS = {"intrinsics": "fx,fy,cx,cy", "distortion": "k1,k2,p1,p2,k3"}  # of lists of numbers
 # what Hydra says of a choice that is made already, and of a setting that there is
 _THERE = re.compile(r"(?:Multiple values for |.* already at ')(\S+?)(?:\. |')")
@@ -101,6 +115,10 @@ def _explain_missing(key: str, typed: str, name: str, conf: Path, arguments: lis
     key = re.sub(r"\[(\d+)\]", r".\1", key)
     if new := rename_missing(key, name):
         return f"{key}: is now {new}"
+    if key in GIVEN:
+        return tell_given(key)
+    if instead := _TEMPLATES.get(name, {}).get(key):
+        return f"{key}: there is no such setting; {instead}"
     cfg = compose_without(typed, name, conf, arguments)
     section, _, last = key.rpartition(".")
     target = OmegaConf.select(cfg, f"{section}._target_", throw_on_resolution_failure=False)

@@ -20,6 +20,13 @@ from posefilter.errors import UserError, find_reason
 Variant = Callable[[Any], Callable[..., Any]]
 _LIBRARIES = ("torch.", "lightning.")
 _PLAIN = (bool, int, float, str)
+# arguments of Lightning's trainer that no file can hold, and what is typed for them
+GIVEN = {
+    "trainer.callbacks": "type +callbacks.NAME._target_=CLASS",
+    "trainer.enable_progress_bar": "console=json shows no bar",
+    "trainer.logger": "type logger=NAME",
+    "trainer.plugins": "leave it out",
+}
 _CALLED_LATER = ("optimizer", "scheduler")  # with what only a trainer knows
 
 
@@ -71,7 +78,7 @@ def _build(
         return arguments
     partial = bool(node.get("_partial_", False))
     if twice := sorted(arguments.keys() & given.keys()):
-        raise UserError(f"{where}.{twice[0]}: is not a setting; the program gives it itself")
+        raise UserError(tell_given(f"{where}.{twice[0]}"))
     check_arguments(target, arguments, given, where, partial)
     target = variant(target) if variant is not None else target
     made = functools.partial(target, **arguments, **given)
@@ -87,6 +94,12 @@ def _build(
             raise
         reason = " ".join(str(error).split())[:300]
         raise UserError(f"{where}: cannot be built ({reason})") from error
+
+
+def tell_given(key: str) -> str:
+    """Return that an argument is the program's own, and what is typed for it."""
+    instead = f"; {GIVEN[key]}" if key in GIVEN else ""
+    return f"{key}: is not a setting; the program gives it itself{instead}"
 
 
 def locate(name: str, where: str, scope: Scope = Scope.CONFIG) -> Callable[..., Any]:
