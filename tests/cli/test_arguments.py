@@ -236,6 +236,14 @@ def test_an_option_whose_value_is_left_out_takes_no_setting(
     assert options_first(typed) == ordered
 
 
+@pytest.mark.parametrize("option", ["--experimental-rerun", "--exp"])
+def test_hydras_own_way_to_run_again_is_refused(option: str) -> None:
+    told = r"^--experimental-rerun: .* type resume=RUN to go on with a run$"
+    for typed in ([option, "run/.hydra/job.pickle"], [f"{option}=run/.hydra/job.pickle"]):
+        with pytest.raises(UserError, match=told):
+            options_first(typed)
+
+
 def test_a_search_maximizes_unless_told_otherwise() -> None:
     search, direction = ["-m", "hydra/sweeper=optuna"], "hydra.sweeper.direction="
     assert maximized(search) == [*search, f"{direction}maximize"]

@@ -11,10 +11,11 @@ from posefilter.cli.plain import find, key_of
 from posefilter.errors import UserError
 
 MULTIRUN = ("-m", "--multirun")
+_RERUN = "--experimental-rerun"
 # options of Hydra that a value follows
 _VALUED = (
     *("--cfg", "-c", "--package", "-p", "--config-path", "-cp", "--config-name", "-cn"),
-    *("--config-dir", "-cd", "--shell-completion-for", "--experimental-rerun"),
+    *("--config-dir", "-cd", "--shell-completion-for", _RERUN),
 )
 _INFO = ("--info", "-i")
 _LONG = (  # Hydra's options that are spelled out, which may be cut short
@@ -42,7 +43,7 @@ def options_first(arguments: Sequence[str]) -> list[str]:
     settings on both sides of an option.
 
     Raises:
-        UserError: An option is none of Hydra's, as where a setting is typed as one.
+        UserError: An option is none of Hydra's, as where a setting is typed as one, or not of use.
     """
     options, settings, left = list[str](), list[str](), list(arguments)
     while left:
@@ -54,6 +55,10 @@ def options_first(arguments: Sequence[str]) -> list[str]:
         if name.startswith("--") and not any(one.startswith(name) for one in _LONG):
             own = name.lstrip("-")
             raise UserError(f"{name}: is no option; settings are typed {own}={value or '...'}")
+        if len(name) > len("--") and _RERUN.startswith(name):
+            raise UserError(
+                f"{_RERUN}: reads a file that no run has here; type resume=RUN to go on with a run"
+            )
         options.append(word)
         if word in _INFO:  # whose value may be left out
             options.append(left.pop(0) if left and left[0] in _KINDS else _KINDS[0])
