@@ -13,6 +13,7 @@ from omegaconf import OmegaConf
 from posefilter.cli import run_command
 from posefilter.cli.build import list_swept, make_trainer, quiet
 from posefilter.cli.evaluate import make_tester
+from posefilter.cli.instantiate import instantiate
 from posefilter.cli.job import Job
 from posefilter.cli.results import record
 from posefilter.errors import UserError
@@ -120,6 +121,13 @@ def test_no_results_are_written_of_no_image() -> None:
 def test_a_precision_that_blurs_poses_is_refused(precision: str) -> None:
     with pytest.raises(UserError, match=rf"trainer\.precision={precision}: .*32-true"):
         make_trainer(OmegaConf.create({**SETTINGS, "precision": precision}), [])
+
+
+def test_a_callback_that_may_not_be_built_is_told_which_may() -> None:
+    name = "lightning.pytorch.callbacks.RichProgressBar"
+    told = r"^callbacks\.bar\._target_=.*RichProgressBar: is not on the list .*EarlyStopping, "
+    with pytest.raises(UserError, match=told):
+        instantiate({"bar": {"_target_": name}}, "callbacks")
 
 
 def test_full_precision_is_taken() -> None:

@@ -173,7 +173,7 @@ def check_name(name: str, where: str, scope: Scope) -> None:
         is_listed(name, scope)
         or is_component(module, scope)
         # a misspelt name may then be told: it is built only if listed itself
-        or listed_in(module, Scope.RECIPE)
+        or listed_in(module, scope)
         or is_plugin(name)
     ):
         return
