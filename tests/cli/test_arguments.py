@@ -21,7 +21,7 @@ from posefilter.cli.build import make_trainer
 from posefilter.cli.choices import check_added, check_choices
 from posefilter.cli.command import compose_config
 from posefilter.cli.explain import near
-from posefilter.cli.job import Job
+from posefilter.cli.job import Job, check_settings
 from posefilter.errors import MISTAKE, UserError
 
 HOME = Path(__file__).parents[2]
@@ -234,6 +234,22 @@ def test_an_option_whose_value_is_left_out_takes_no_setting(
     typed: list[str], ordered: list[str]
 ) -> None:
     assert options_first(typed) == ordered
+
+
+@pytest.mark.parametrize("typed", [["-cn", "predict"], ["--config-name=predict"]])
+def test_the_settings_of_another_command_are_refused(
+    typed: list[str], capfd: pytest.CaptureFixture[str]
+) -> None:
+    assert run_command("train", HOME, typed) == 2
+    (line,) = capfd.readouterr().err.splitlines()
+    assert line.startswith(
+        "train: --config-name=predict: is not train's, but has the settings of predict"
+    )
+
+
+def test_settings_of_ones_own_that_choose_no_method_are_told_what_is_missing() -> None:
+    with pytest.raises(UserError, match=r"model: nothing .* to the defaults in your own file"):
+        check_settings(OmegaConf.create({"seed": 0}), "train", {})
 
 
 @pytest.mark.parametrize("option", ["--experimental-rerun", "--exp"])

@@ -2,11 +2,13 @@
 
 import re
 from collections.abc import Sequence
+from itertools import pairwise
 from pathlib import Path
 
 from hydra.core.override_parser.overrides_parser import OverridesParser
 
 from posefilter.cli.choices import SEVERAL, read_settings
+from posefilter.cli.main import COMMANDS
 from posefilter.cli.plain import find, key_of
 from posefilter.errors import UserError
 
@@ -65,6 +67,18 @@ def options_first(arguments: Sequence[str]) -> list[str]:
         elif word in _VALUED and left:
             options.append(left.pop(0))
     return [*options, *settings]
+
+
+def check_config_name(arguments: Sequence[str], command: str) -> None:
+    """Raise UserError where the settings of another command are named."""
+    words = [part for argument in arguments for part in argument.split("=", 1)]
+    for option, name in pairwise(words):
+        other = name.removesuffix(".yaml")
+        if option in ("--config-name", "-cn") and other in COMMANDS and other != command:
+            raise UserError(
+                f"--config-name={name}: is not {command}'s, but has the settings of {other}, which "
+                "is a command of its own"
+            )
 
 
 def without_deletion(arguments: Sequence[str]) -> list[str]:

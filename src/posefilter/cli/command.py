@@ -19,6 +19,7 @@ from posefilter.cli.ablations import register_ablations
 from posefilter.cli.arguments import (
     MULTIRUN,
     bracketed,
+    check_config_name,
     defer_settings,
     maximized,
     name_places,
@@ -105,6 +106,7 @@ def run_command(name: str, home: Path | None = None, arguments: list[str] | None
             )
         arguments = without_trace(arguments, name)
         arguments = without_deletion(arguments)
+        check_config_name(arguments, name)
         check_choices(arguments, conf, name)
         if {"--cfg", "-c"} & {*arguments} and {*MULTIRUN} & {*arguments}:
             raise UserError("--cfg shows the settings of one job; leave -m out")

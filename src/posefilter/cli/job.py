@@ -172,9 +172,11 @@ def check_settings(cfg: DictConfig, command: str, choices: Mapping[str, str] | N
         _check_package(plain, choices)
     for key in _NEEDED.get(command, ()):
         if choices is not None and key not in plain and key not in choices:
+            model = choices.get("model")
+            place = "your own file" if model is None else f"the file of model={model}"
             raise UserError(
                 f"{key}: nothing chooses one; type {key}=NAME, or add `- /{key}: NAME` to the "
-                f"defaults in the file of model={choices.get('model')}"
+                f"defaults in {place}"
             )
         if plain.get(key) is None:
             raise UserError(f"{key}=null: {command} requires a value; leave it out for the default")
