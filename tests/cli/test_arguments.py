@@ -247,6 +247,12 @@ def test_the_settings_of_another_command_are_refused(
     )
 
 
+def test_a_trainers_choices_are_those_of_a_training(capfd: pytest.CaptureFixture[str]) -> None:
+    """evaluate's has no steps."""
+    assert run_command("train", HOME, ["trainer=cpu"]) == 2
+    assert "trainer=cpu: there is no such choice; there are default; " in capfd.readouterr().err
+
+
 def test_settings_of_ones_own_that_choose_no_method_are_told_what_is_missing() -> None:
     with pytest.raises(UserError, match=r"model: nothing .* to the defaults in your own file"):
         check_settings(OmegaConf.create({"seed": 0}), "train", {})
