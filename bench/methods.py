@@ -61,7 +61,7 @@ END_TO_END = (
 # kernels of the true pose three and four times as wide as the default's
 WIDE = "loss.terms.pose.translation_mm=60 loss.terms.pose.rotation_deg=40"
 VALUES = re.compile(r",(?![^\[{]*[\]}])")  # between values of a sweep: a list or a dict is one
-TRAIN_RESAMPLE = "filter/resample@model.train_filter.resample"
+TRAIN_RESAMPLE = "filter/resample@model.train_rollout.resample"
 
 
 class Line(NamedTuple):
@@ -120,7 +120,7 @@ def plan(meshes: str | None = None, frames: str | None = None) -> list[Line]:
         # two steps alone, from where the paper's particles start
         Line(
             "short_start",
-            f"{short} model.train_filter.initialize.object_fraction=0.0 loss/schedule=none "
+            f"{short} model.train_rollout.initialize.object_fraction=0.0 loss/schedule=none "
             "seed=0,1,2",
         ),
         # the classes balanced in the loss itself, and not in one more beside it

@@ -262,7 +262,7 @@ RANGES: dict[str, Range] = {
     "model.crops": _whole(2, 100_000),
     "model.train_cells": COUNT,
     "model.near_cells": _whole(1, 1000),
-    "train_filter.steps": _whole(1, 10_000),
+    "train_rollout.steps": _whole(1, 10_000),
     # loss
     **_each("loss", COUNT, "points", "max_pixels"),
     **_each("loss", POSITIVE, "scale", "sigma"),

@@ -25,6 +25,10 @@ OLD = {
         "filter": "${filter}",
         "loss": {"_target_": "posefilter.losses.contrast.Contrast"},
         "start": "not an argument that was renamed here",
+        "train_filter": {
+            "_target_": "posefilter.filters.loop.ParticleFilter",
+            "first_particles": None,
+        },
         "loss_schedule": [
             {
                 "_target_": "posefilter.models.loss_schedule.Stage",
@@ -64,6 +68,10 @@ NEW = {
         "filter": "${filter}",
         "loss": {"_target_": "posefilter.losses.contrastive.Contrastive"},
         "start": "not an argument that was renamed here",
+        "train_rollout": {
+            "_target_": "posefilter.filters.loop.ParticleFilter",
+            "initial_particles": None,
+        },
         "loss_schedule": [
             {
                 "_target_": "posefilter.models.loss_schedule.Stage",
@@ -114,14 +122,29 @@ NEW = {
 
 
 def test_an_old_recipe_is_read_by_todays_names() -> None:
-    choices = {"loss": "contrast", "filter/reweight": "annealed", "filter/refine": "mean_shift"}
+    choices = {
+        "loss": "contrast",
+        "filter/reweight": "annealed",
+        "filter/refine": "mean_shift",
+        "filter/resample@model.train_filter.resample": "never",
+    }
     found = check_recipe({"choices": choices, "settings": OLD})
     assert found["settings"] == NEW
     assert found["choices"] == {
         "loss": "contrastive",
         "filter/reweight": "current_likelihood",
         "filter/refine": "mean_shift",
+        "filter/resample@model.train_rollout.resample": "none",
     }
+
+
+@pytest.mark.parametrize(("setting", "old", "new"), [("model", "train_filter", "train_rollout")])
+def test_a_class_of_ones_own_has_the_arguments_of_its_base(
+    setting: str, old: str, new: str
+) -> None:
+    own = {"_target_": "ownpf.method.Own", "looks": 1}
+    found = check_recipe({"choices": {}, "settings": {setting: own | {old: None}}})
+    assert found["settings"] == {setting: own | {new: None}}
 
 
 def test_an_argument_with_both_names_keeps_both_for_the_refusal() -> None:

@@ -78,6 +78,13 @@ def test_a_class_that_is_not_there_is_told_before_what_does_not_fit(
     assert ("was it renamed after the checkpoint?" in str(told.value)) is renamed
 
 
+@pytest.mark.parametrize("target", ["ownpf.method.OwnScore", "posefilter.models.patch_pf.PatchPF"])
+def test_an_old_argument_of_a_parent_is_answered_by_the_new_one(target: str, package: Path) -> None:
+    with pytest.raises(UserError) as refused:
+        instantiate({"_target_": target, "train_filter": None}, "model")
+    assert str(refused.value) == "model.train_filter: is now train_rollout"
+
+
 @pytest.mark.parametrize(
     ("node", "told"),
     [

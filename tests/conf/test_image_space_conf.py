@@ -84,7 +84,7 @@ def test_the_papers_figures(model: str) -> None:
     method = build_method(recipe(job), square())
     assert not method.aux_losses
     assert not method.loss_schedule
-    assert method.train_filter is method.filter
+    assert method.train_rollout is method.filter
     batch_norms = sum(
         isinstance(m, torch.nn.modules.batchnorm._BatchNorm) for m in method.modules()
     )
@@ -108,7 +108,7 @@ REMEDIES = [
     "loss/schedule=three_stages",
     "model/train_rollout=full",
     "model/train_rollout=resampled loss=belief_nll",
-    "model/train_rollout=resampled filter/resample@model.train_filter.resample=optimal_transport",
+    "model/train_rollout=resampled filter/resample@model.train_rollout.resample=optimal_transport",
     "filter/resample=none",
     "filter/resample=auxiliary",
     "filter/initialize=from_objectness",

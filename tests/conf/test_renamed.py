@@ -32,7 +32,9 @@ RENAMED = {
     "proposals=none": "model/proposals=none",
     "train_filter=short": "model/train_rollout=short",
     "model/train_rollout=truncated": "model/train_rollout=short",
-    "train_filter.steps=3": "model.train_filter.steps=3",
+    "train_filter.steps=3": "model.train_rollout.steps=3",
+    "model.train_filter.steps=3": "model.train_rollout.steps=3",
+    "~model.train_filter.resample": "~model.train_rollout.resample",
     "motion_lesson=towards": "loss/aux/displacement=towards_object",
     "aux_displacement=center": (
         "loss/aux/displacement=towards_object "
@@ -95,14 +97,17 @@ RENAMED = {
     ),
     "loss=belief_maps": "loss=heatmaps",
     "filter.first_particles=100": "filter.initial_particles=100",
-    "model.train_filter.first_particles=null": "model.train_filter.initial_particles=null",
-    "train_filter.first_particles=null": "model.train_filter.initial_particles=null",
+    "model.train_filter.first_particles=null": "model.train_rollout.initial_particles=null",
+    "train_filter.first_particles=null": "model.train_rollout.initial_particles=null",
     "model.candidate_sampler.levels=4": "model.candidate_sampler.sigma_levels=4",
     "lesson.levels=4": "model.candidate_sampler.sigma_levels=4",
     "filter/resample=below_ess": "filter/resample=adaptive",
     "resample=below_ess,guided": "filter/resample=adaptive,auxiliary",
     "filter/resample@model.train_filter.resample=never": (
-        "filter/resample@model.train_filter.resample=none"
+        "filter/resample@model.train_rollout.resample=none"
+    ),
+    "filter/resample@model.train_filter.resample=soft": (
+        "filter/resample@model.train_rollout.resample=soft"
     ),
     "sweep=iterations": "sweep=steps",
     "tracker.walk=0.4": "tracker.noise_scale=0.4",

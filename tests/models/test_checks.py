@@ -213,17 +213,17 @@ def test_all_steps_of_a_training_rollout_have_as_many_particles(model: str, tmp_
 
 def test_initial_particles_of_a_training_filter_are_named_by_their_key(tmp_path: Path) -> None:
     wide = [
-        "model.train_filter.initial_particles=200",
-        "model.train_filter.resample._target_=posefilter.filters.resample.Systematic",
+        "model.train_rollout.initial_particles=200",
+        "model.train_rollout.resample._target_=posefilter.filters.resample.Systematic",
     ]
     method = images(tmp_path, "model=patch_pf", *wide)
-    assert isinstance(method.train_filter.resample, Systematic)
+    assert isinstance(method.train_rollout.resample, Systematic)
     with pytest.raises(UserError) as refusal:
-        check_particle_counts(method.train_filter, "model.train_filter")
+        check_particle_counts(method.train_rollout, "model.train_rollout")
     one_line(
         refusal,
-        "model.train_filter.initial_particles=200",
-        "model.train_filter.initial_particles=null",
+        "model.train_rollout.initial_particles=200",
+        "model.train_rollout.initial_particles=null",
     )
 
 

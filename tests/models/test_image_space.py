@@ -98,7 +98,7 @@ def working(kind: type[ImageSpace], size: int, **changes: Any) -> ImageSpace:
         "filter": run_filter(
             64, 4, resample=Systematic(), estimate=Argmax() if detects else Agreement()
         ),
-        "train_filter": run_filter(64, 2, Informed(UniformPixels(), 0.5, 5.0)),
+        "train_rollout": run_filter(64, 2, Informed(UniformPixels(), 0.5, 5.0)),
         "loss": Chamfer(size) if detects else Confidence(OnObject(size)),
         "optimizer": partial(torch.optim.AdamW, lr=3e-3),
     }

@@ -247,7 +247,7 @@ def test_a_training_walks_through_its_stages() -> None:
 
 def roll(method: ImageSpace, truncate: int | None) -> Trace:
     method.truncate = truncate
-    trace: Trace = method.train_filter(scenes(2), method, torch.Generator().manual_seed(5))
+    trace: Trace = method.train_rollout(scenes(2), method, torch.Generator().manual_seed(5))
     return trace
 
 
@@ -284,7 +284,7 @@ def parts(trace: Trace) -> list[Tensor]:
 def test_a_cut_gradient_changes_no_value(kind: type[ImageSpace], truncate: int) -> None:
     torch.manual_seed(0)
     method = working(
-        kind, 3, detach_position=False, train_filter=run_filter(12, 6, resample=Systematic())
+        kind, 3, detach_position=False, train_rollout=run_filter(12, 6, resample=Systematic())
     )
     whole, cut = roll(method, None), roll(method, truncate)
     for a, b in zip(parts(whole), parts(cut), strict=True):
@@ -297,7 +297,7 @@ def test_a_cut_gradient_changes_no_value(kind: type[ImageSpace], truncate: int) 
 def test_a_truncated_step_has_no_gradient_of_earlier_ones() -> None:
     torch.manual_seed(0)
     # reads patch, context and place
-    method = working(PatchPF, 3, detach_position=False, train_filter=run_filter(12, 6))
+    method = working(PatchPF, 3, detach_position=False, train_rollout=run_filter(12, 6))
     every = {(later, earlier) for later in range(6) for earlier in range(later)}
     whole = roll(method, None)
     assert pairs(whole, "displacement") == pairs(whole, "latent") == every
@@ -311,9 +311,9 @@ def test_a_truncated_step_has_no_gradient_of_earlier_ones() -> None:
 
 def test_a_latent_is_cut_into_stretches() -> None:
     torch.manual_seed(0)
-    method = working(PatchPF, 3, detach_position=False, train_filter=run_filter(12, 6))
+    method = working(PatchPF, 3, detach_position=False, train_rollout=run_filter(12, 6))
     # no particle moves, so that latent is all that a step hands on
-    method.train_filter.propagate = Identity()
+    method.train_rollout.propagate = Identity()
     assert pairs(roll(method, 2), "latent") == {(1, 0), (3, 2), (5, 4)}
     assert pairs(roll(method, 3), "latent") == {(1, 0), (2, 0), (2, 1), (4, 3), (5, 3), (5, 4)}
     assert not pairs(roll(method, 1), "latent")
@@ -325,7 +325,7 @@ def test_positions_with_a_loss_are_not_truncated() -> None:
     looked at is cut.
     """
     torch.manual_seed(0)
-    trace = roll(working(PatchPF, 3, detach_position=False, train_filter=run_filter(12, 4)), 1)
+    trace = roll(working(PatchPF, 3, detach_position=False, train_rollout=run_filter(12, 4)), 1)
     for earlier in range(3):
         (gradient,) = torch.autograd.grad(
             trace.particles[3].state.sum(), trace.outputs[earlier].displacement, retain_graph=True

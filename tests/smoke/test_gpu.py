@@ -32,7 +32,7 @@ SCENE = HOME / "docs" / "scenes" / "003_cracker_box" / "mixed" / "scene0003_0" /
 K = np.array([[533.39, 0, 156.24], [0, 533.74, 120.41], [0, 0, 1]])
 END_TO_END = ["loss=belief_nll_pose", "model/pose_head=surface_point"]
 END_TO_END += ["model/train_rollout=resampled"]
-END_TO_END += ["filter/resample@model.train_filter.resample=optimal_transport"]
+END_TO_END += ["filter/resample@model.train_rollout.resample=optimal_transport"]
 
 
 @pytest.fixture(scope="module")

@@ -117,7 +117,7 @@ IMAGE_SPACE_ABLATIONS = (
         ("m6_position", "Working, with gradient through the position.",
          "model.detach_position=false"),
         ("m7_informed", "Working, with training particles that start anywhere.",
-         "model.train_filter.initialize.object_fraction=0.0"),
+         "model.train_rollout.initialize.object_fraction=0.0"),
         ("m8_short",
          "Working, with full training roll-outs of particles half of which start on or around the "
          "object.", "model/train_rollout=full", "filter/initialize=informed"),

@@ -207,8 +207,11 @@ def check_arguments(
     for name in arguments:  # before any value: a misspelt name often leaves a wrong value elsewhere
         if name not in known and not others:
             label = getattr(target, "__name__", str(target))
-            new = rename_argument(f"{target.__module__}.{label}", name)
-            if new is not None:
+            kinds = (
+                target.__mro__ if inspect.isclass(target) else (target,)
+            )  # a parent's argument too
+            places = (f"{kind.__module__}.{getattr(kind, '__name__', kind)}" for kind in kinds)
+            if new := next(filter(None, (rename_argument(one, name) for one in places)), None):
                 raise UserError(f"{where}.{name}: is now {new}")
             raise UserError(f"{where}.{name}: {label} takes no such setting{hint(name, known)}")
     for name, value in arguments.items():

@@ -64,7 +64,7 @@ KEYS = {
     "compact": "quantize",
     **_join(
         _read("""
-model: place_gradient > detach_position, relevance > objectness_weight
+model: place_gradient > detach_position, relevance > objectness_weight, train_filter > train_rollout
 callbacks.figures: every > every_n_validations, without > exclude
 model.candidate_sampler: turns > rotations, levels > sigma_levels
 data: points > num_model_points, model_points > model_points_dir
@@ -72,7 +72,7 @@ data.generate: occlusion > max_occlusion, occluded_share > occluded_fraction,
     tabletop_share > tabletop_fraction, absent_share > absent_fraction,
     covered_frames > fully_occluded_frames
 filter: looks > max_searches, first_particles > initial_particles
-model.train_filter: first_particles > initial_particles
+model.train_rollout: first_particles > initial_particles
 tracker: walk > noise_scale, move_scale > noise_scale, kld_cell > kld_bin_size,
     jump > jump_penalty, epsilon > kld_epsilon, quantile > kld_quantile, cell > kld_bin_size,
     look_around > whole_image_every, side > window_side, reach > window_scale,
@@ -200,6 +200,7 @@ models.candidate_samplers.CandidatePoses: each > candidates_per_kind, turns > ro
     sigma > sigma_range, start > initial_sigma
 models.candidate_samplers.LabeledRays: past > margin_behind, start > min_depth
 models.box_heads.QuantileBox: beyond > quantile
+models.base.PoseEstimator: train_filter > train_rollout
 models.cnn_patch.CnnPatch: relevance > objectness_weight, relevance_weight > objectness_weight
 models.downsized.Downsized: relevance > objectness_weight, relevance_weight > objectness_weight
 models.patch_pf.PatchPF: relevance > objectness_weight, relevance_weight > objectness_weight
@@ -229,6 +230,8 @@ callbacks.health.FilterHealth: most > max_iterations, share > max_time_fraction
 callbacks.diagnostics.Diagnostics: share > max_time_fraction
 callbacks.figures.Figures: share > max_time_fraction
 """)
+# base classes, by the setting that holds one of them: one's own class there has their arguments too
+BASES = {"model": "models.base.PoseEstimator"}
 # values of arguments of classes, likewise
 VALUES = {("synthetic.generate.generate", "lookalike_texture"): CHOICES["lookalike_texture"]}
 # options of the data module, by the reader that takes them

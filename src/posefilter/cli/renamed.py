@@ -9,6 +9,7 @@ from typing import Any
 
 from posefilter.cli.old_names import (
     ARGUMENTS,
+    BASES,
     CHOICES,
     CLASSES,
     COMMANDS,
@@ -19,7 +20,7 @@ from posefilter.cli.old_names import (
 )
 
 _NAMES = GROUPS | KEYS
-_NODES = {"model/train_rollout": "model.train_filter", "loss/schedule": "model.loss_schedule"}
+_NODES = {"loss/schedule": "model.loss_schedule"}
 _LOSSES = {"relevance": "objectness"}  # in the stages of a training
 _DATA = "data.module.PoseDataModule"  # whose options are those of its reader
 _MISSING = {
@@ -75,6 +76,9 @@ def _split(override: str) -> tuple[str, str, str, str]:
 def _rename_key(key: str) -> str:
     if key in _NAMES:
         return _NAMES[key]
+    group, at, package = key.partition("@")
+    if at:  # a choice whose settings go elsewhere
+        return f"{group}@{_rename_key(package)}"
     head, dot, rest = key.partition(".")
     if not dot:
         return key
@@ -110,20 +114,22 @@ def upgrade(recipe: Mapping[str, Any]) -> dict[str, Any]:
         recipe: Its `choices` and `settings`, checked for depth and size.
     """
     choices = {
-        group: _choices_of(group).get(choice, choice) for group, choice in recipe["choices"].items()
+        _rename_key(group) if "@" in group else group: _choices_of(group).get(choice, choice)
+        for group, choice in recipe["choices"].items()
     }
     return {"choices": choices, "settings": _upgrade(recipe["settings"])}
 
 
-def _upgrade(node: Any) -> Any:
+def _upgrade(node: Any, setting: str = "") -> Any:
     if isinstance(node, list):
         return [_upgrade(value) for value in node]
     if not isinstance(node, Mapping):
         return node
     target = rename_class(node.get("_target_")) or node.get("_target_")
+    base = BASES.get(setting) if target else None
     out = {}
     for key, value in node.items():
-        name = rename_argument(target, str(key)) or key
+        name = rename_argument(target, str(key)) or rename_argument(base, str(key)) or key
         if name == "loss_weights" and isinstance(value, Mapping):  # in a stage of a training
             value = {_LOSSES.get(loss, loss): factor for loss, factor in value.items()}
         if key == "options" and isinstance(value, Mapping) and _below(target) == _DATA:
@@ -134,7 +140,8 @@ def _upgrade(node: Any) -> Any:
         if isinstance(value, str):
             value = values.get(value, value)
         # both names: the old one is refused when the class is built
-        out[key if name in node else name] = target if key == "_target_" else _upgrade(value)
+        own = target if key == "_target_" else _upgrade(value, str(name))
+        out[key if name in node else name] = own
     return out
 
 

@@ -65,7 +65,7 @@ def learned_from(job: Job) -> str:
     method: Any = locate(str(cfg.model._target_), "model")
     tested = {
         *method.test_only_settings,
-        *(["filter"] if used["model"].get("train_filter") else []),
+        *(["filter"] if used["model"].get("train_rollout") else []),
     }
     used["model"] = {key: value for key, value in used["model"].items() if key not in tested}
     used["data"] = {key: value for key, value in used["data"].items() if key not in _TESTED_WITH}

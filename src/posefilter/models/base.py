@@ -74,7 +74,7 @@ class PoseEstimator(Module):
         optimizer: Given (name, parameter) pairs.
         scheduler: Given the optimizer, and the number of steps where it has a parameter for it
             (`lr_schedulers.LENGTHS`); advanced at each step.
-        train_filter: Rolled out in training; None: `filter`.
+        train_rollout: Rolled out in training; None: `filter`.
         seed: Decides every random draw, together with the epoch and the batch's number.
     """
 
@@ -94,11 +94,11 @@ class PoseEstimator(Module):
         loss: Loss,
         optimizer: Callable[[Iterable[tuple[str, nn.Parameter]]], Optimizer],
         scheduler: Callable[..., LRScheduler] | None = None,
-        train_filter: ParticleFilter | None = None,
+        train_rollout: ParticleFilter | None = None,
         seed: int = 0,
     ) -> None:
         super().__init__()
-        self.filter, self.train_filter, self.loss = filter, train_filter or filter, loss
+        self.filter, self.train_rollout, self.loss = filter, train_rollout or filter, loss
         self.make_optimizer, self.make_scheduler, self.seed = optimizer, scheduler, seed
         if scheduler is not None:
             find_length(scheduler)  # a setting that is missing is told before the training begins
@@ -369,7 +369,7 @@ class PoseEstimator(Module):
 
         The default is the chosen loss of one roll-out.
         """
-        trace = self.train_filter(batch, self, generator)
+        trace = self.train_rollout(batch, self, generator)
         return {"loss": self.loss(trace, batch, self.object_model)}
 
     def log_scalar(self, name: str, value: Tensor) -> None:

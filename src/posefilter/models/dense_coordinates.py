@@ -56,7 +56,7 @@ class DenseCoordinates(Hypotheses):
         "pose_space",
         "propose_poses",
     )
-    test_only_settings = ("filter", "train_filter", "cells", "inlier", "refits")
+    test_only_settings = ("filter", "train_rollout", "cells", "inlier", "refits")
 
     def __init__(
         self,

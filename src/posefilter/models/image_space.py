@@ -207,10 +207,10 @@ class ImageSpace(PoseEstimator):
         Returns:
             The chosen loss, the auxiliary losses and the objectness loss, (B,) each.
         """
-        name = "filter" if self.train_filter is self.filter else "model.train_filter"
-        check_particle_counts(self.train_filter, name)
+        name = "filter" if self.train_rollout is self.filter else "model.train_rollout"
+        check_particle_counts(self.train_rollout, name)
         encoding = self.encode(batch)
-        trace: Trace = self.train_filter(batch, with_encoding(self, encoding), generator)
+        trace: Trace = self.train_rollout(batch, with_encoding(self, encoding), generator)
         losses = {"loss": self.loss(trace, batch, self.object_model)}
         for name, aux in self.aux_losses.items():
             losses[name] = aux.weight * aux.loss(trace, batch, self.object_model)

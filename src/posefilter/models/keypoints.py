@@ -64,7 +64,7 @@ class Keypoints(Hypotheses):
     """
 
     provides: ClassVar[Capabilities] = ("heatmaps", "depth", "pose", "pose_space", "propose_poses")
-    test_only_settings = ("filter", "train_filter", "peaks", "subset", "inlier_px")
+    test_only_settings = ("filter", "train_rollout", "peaks", "subset", "inlier_px")
 
     def __init__(
         self,

@@ -95,7 +95,7 @@ class Hypotheses(PoseParticles):
 
     provides: ClassVar[Capabilities] = ("pose", "pose_space", "propose_poses")
     # training rolls out no filter
-    test_only_settings: ClassVar[tuple[str, ...]] = ("filter", "train_filter")
+    test_only_settings: ClassVar[tuple[str, ...]] = ("filter", "train_rollout")
 
     @abstractmethod
     def propose_poses(self, encoding: Any, particles: int, generator: Generator) -> Tensor:

@@ -79,7 +79,7 @@ class PosePF(PoseParticles):
 
     provides: ClassVar[Capabilities] = ("color", "depth", "pose", "pose_space", "score_poses")
     # training rolls out no filter
-    test_only_settings: ClassVar[tuple[str, ...]] = ("filter", "train_filter", "pixels")
+    test_only_settings: ClassVar[tuple[str, ...]] = ("filter", "train_rollout", "pixels")
     test_only_settings += ("quasi_monte_carlo",)
     # for comparing the scores of estimate and truth: image points, noise level [m]
     comparison_pixels, comparison_sigma = 4096, 0.004

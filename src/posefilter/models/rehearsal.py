@@ -202,7 +202,7 @@ class _Watcher:
     def watch(self) -> None:
         """Watch the method, its filters, its likelihood, its loss and the labels of its losses."""
         method = self.method
-        for one in (method.filter, method.train_filter):
+        for one in (method.filter, method.train_rollout):
             for name in _VERBS:
                 self._extend(getattr(one, name), __call__=getattr(self, f"_{name}"))
         self._extend(method.loss, __call__=self._loss)

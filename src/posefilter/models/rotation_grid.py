@@ -74,7 +74,7 @@ class RotationGrid(PoseParticles):
         "pose_space",
         "score_poses",
     )
-    test_only_settings = ("filter", "train_filter")  # training rolls out no filter
+    test_only_settings = ("filter", "train_rollout")  # training rolls out no filter
     codes: Tensor
     grid: Tensor
 
