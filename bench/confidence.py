@@ -203,7 +203,7 @@ def look(
             row = {"object": result.object, "image": records[own[0]].name, "input": spoil}
             row |= {"there": result.object in there, "verdict": result.verdict}
             row |= {"probability": probability_of(result), "presence": result.presence}
-            row |= {"apparent_size": result.apparent_size, "wrong_size": result.wrong_size}
+            row |= {"scale_ratio": result.scale_ratio, "wrong_size": result.wrong_size}
             if result.object in there:
                 sample = there[result.object]
                 truth = sample.camera_from_object.astype(np.float64)

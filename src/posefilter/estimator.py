@@ -208,12 +208,12 @@ class Estimator:
             with torch.no_grad():
                 trace = method.predict_step(batch, 0)
                 found = method.assess(trace, batch)
-                apparent = method.measure_apparent_size(trace, batch)
+                ratio = method.measure_scale_ratio(trace, batch)
                 belief, draws = method.calibrate_belief(trace.belief, found)
             trace = trace._replace(belief=belief)
             trace.belief.best.cpu()  # waits for a GPU
             seconds = (time.perf_counter() - start) / len(images.depth)
-            runs.append(Run(method, batch, trace, seconds, found, apparent, blank, draws))
+            runs.append(Run(method, batch, trace, seconds, found, ratio, blank, draws))
         return runs
 
 

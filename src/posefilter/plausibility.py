@@ -19,25 +19,25 @@ def find_warnings(
     object_model: ObjectModel,
     depth: np.ndarray,
     intrinsics: np.ndarray,
-    apparent_size: float | None = None,
+    scale_ratio: float | None = None,
 ) -> tuple[str, ...]:
     """Return what makes an estimate implausible, one sentence each: first what makes the inputs
     so, see `find_input_warnings`.
 
     A wrong depth scale moves the answer with it, and its score does not fall: only the object's
-    size tells, as a whole and between its points (`confidence.apparent_size`).
+    size tells, as a whole and between its points (`confidence.scale_ratio`).
 
     Args:
         pose: The estimate (4, 4), camera_from_object [m].
         object_model: The object.
         depth: Measured z-depth (H, W) [m], 0 where unknown, at the network's resolution.
         intrinsics: Its camera matrix (3, 3) [px].
-        apparent_size: How large the object appears, relative to its mesh, where that contradicts
+        scale_ratio: How large the object appears, relative to its mesh, where that contradicts
             the inputs.
     """
     height, width = depth.shape
     x, y, z = (pose[:3, :3] @ object_model.center.double().numpy() + pose[:3, 3]).tolist()
-    found = [*find_input_warnings(depth, intrinsics, apparent_size)]
+    found = [*find_input_warnings(depth, intrinsics, scale_ratio)]
     if z <= 0:
         return (*found, "the object would be behind the camera")
     focal = float(np.sqrt(intrinsics[0, 0] * intrinsics[1, 1]))
@@ -60,7 +60,7 @@ def find_warnings(
 
 
 def find_input_warnings(
-    depth: np.ndarray, intrinsics: np.ndarray, apparent_size: float | None = None
+    depth: np.ndarray, intrinsics: np.ndarray, scale_ratio: float | None = None
 ) -> tuple[str, ...]:
     """Return what makes the inputs implausible, whatever the estimate is; arguments as of
     `find_warnings`.
@@ -89,9 +89,9 @@ def find_input_warnings(
             f"the intrinsics' principal point is far from the middle of the image ({off.max():.0%} "
             "of its size): that is right for a part of an image alone"
         )
-    if apparent_size is not None:
+    if scale_ratio is not None:
         found.append(
-            f"the object appears {apparent_size:.2f} times as large as its mesh: are the depth's "
+            f"the object appears {scale_ratio:.2f} times as large as its mesh: are the depth's "
             "units (depth_scale), the intrinsics and the mesh's units right?"
         )
     return tuple(found)

@@ -11,9 +11,9 @@ import torch
 from posefilter.belief import Belief, Mode, PoseSet
 from posefilter.belief.belief import belief_over
 from posefilter.belief.summaries import check_probability
-from posefilter.confidence.apparent_size import ApparentSize
 from posefilter.confidence.calibration import Assessment, Calibration
 from posefilter.confidence.conformal import Conformal
+from posefilter.confidence.scale_ratio import ScaleRatio
 from posefilter.confidence.tolerance import RIGHT, PoseTolerance, check_pose_tolerance
 from posefilter.confidence.verdicts import (
     Costs,
@@ -55,7 +55,7 @@ class Result:
             wide as the errors of right estimates are, and the others are particles, which stand for
             other hypotheses; else every particle and its weight, as the filter leaves them.
         warnings: What makes the estimate implausible, in words; empty where nothing does.
-        apparent_size: How large the object appears, relative to its mesh: 1 where the depth and the
+        scale_ratio: How large the object appears, relative to its mesh: 1 where the depth and the
             intrinsics are right.  NaN where the method cannot tell, or too few pixels show it, and
             for one of several instances.  A track has that of the frame in which it began, or was
             found again; one that contradicts is measured anew in frames with the whole image.
@@ -97,7 +97,7 @@ class Result:
     calibration_note: str = ""
     conformal: Conformal | None = None
     depth_inlier_fraction: float = math.nan
-    apparent_size: float = math.nan
+    scale_ratio: float = math.nan
     wrong_size: bool = False
     blank: str = ""
     instance: int = 0
@@ -270,7 +270,7 @@ class Result:
         if self.verdict == "absent":
             return f"{self.object}: absent, probability {there}"
         if self.verdict == "unsure" and self.wrong_size:
-            return f"{self.object}: unsure, appears {self.apparent_size:.2f} times its size"
+            return f"{self.object}: unsure, appears {self.scale_ratio:.2f} times its size"
         said, tolerance = describe_probability(self.probability), self.pose_tolerance
         if tolerance is not None:
             within = describe_probability(self.probability_within(tolerance))
@@ -335,7 +335,7 @@ class Run(NamedTuple):
     trace: Trace
     seconds: float  # an image
     found: Assessment | None = None  # None where there is no probability
-    size: ApparentSize | None = None  # None where the method cannot tell
+    size: ScaleRatio | None = None  # None where the method cannot tell
     blank: Sequence[str] = ()  # of each image, as `find_blank` says it; none: all can be judged
     # (B,) how many of the belief's first poses are draws about the estimate, None: not calibrated
     draws: torch.Tensor | None = None
@@ -396,7 +396,7 @@ def make_result(
         calibration_note=note,
         conformal=None if calibration is None else calibration.conformal,
         depth_inlier_fraction=values.get("surface", math.nan),
-        apparent_size=size,
+        scale_ratio=size,
         wrong_size=wrong_size,
         blank=blank,
     )

@@ -14,8 +14,8 @@ import pytest
 import torch
 from torch import Generator, Tensor
 
-from posefilter.confidence.apparent_size import ApparentSize
 from posefilter.confidence.calibration import Calibration, Logistic
+from posefilter.confidence.scale_ratio import ScaleRatio
 from posefilter.confidence.second_look import look_again, measure_worth
 from posefilter.filters.traces import keep_last_step
 from posefilter.geometry.camera import back_project
@@ -58,9 +58,9 @@ class Toy:
     def collect_features(self, trace: Trace, batch: Batch) -> dict[str, Tensor]:
         return {"green": self._read(trace, batch, 1)}
 
-    def measure_apparent_size(self, trace: Trace, batch: Batch) -> ApparentSize | None:
+    def measure_scale_ratio(self, trace: Trace, batch: Batch) -> ScaleRatio | None:
         scale = 1 + self._read(trace, batch, 2)
-        return ApparentSize(scale, torch.full_like(scale, 99), torch.ones_like(scale))
+        return ScaleRatio(scale, torch.full_like(scale, 99), torch.ones_like(scale))
 
     def _read(self, trace: Trace, batch: Batch, channel: int) -> Tensor:
         at = trace.belief.poses[:, 0, :2, 3].long()

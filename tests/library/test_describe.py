@@ -68,7 +68,7 @@ def test_among_several_the_probability_is_that_of_the_tolerance_that_was_given()
 
 @pytest.mark.parametrize("verdict", ["found", "unsure", "absent"])
 def test_a_wrong_size_is_told_where_it_makes_unsure(verdict: str) -> None:
-    said = Result.describe(answer(verdict, wrong_size=True, apparent_size=1.25))  # type: ignore[arg-type]
+    said = Result.describe(answer(verdict, wrong_size=True, scale_ratio=1.25))  # type: ignore[arg-type]
     assert ("appears 1.25 times its size" in said) == (verdict == "unsure")
 
 

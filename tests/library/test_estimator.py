@@ -196,13 +196,13 @@ def test_a_depth_that_is_a_fourth_too_large_is_measured_and_not_believed(
     """The likelihood does not notice: its pose is as much too far away as the depth."""
     rgb, depth, K = read_scene(0, ONE_MODE)
     right, large = estimator.predict(rgb, depth, K), estimator.predict(rgb, 1.25 * depth, K)
-    assert right.apparent_size == pytest.approx(1.0, abs=0.08)
+    assert right.scale_ratio == pytest.approx(1.0, abs=0.08)
     assert not right.wrong_size
-    assert large.apparent_size == pytest.approx(1.25, abs=0.08)
+    assert large.scale_ratio == pytest.approx(1.25, abs=0.08)
     assert large.wrong_size
     assert large.probability is not None
     assert large.verdict == "unsure"
-    assert f"appears {large.apparent_size:.2f} times" in large.describe()
+    assert f"appears {large.scale_ratio:.2f} times" in large.describe()
     (warning,) = large.warnings
     assert "depth_scale" in warning
     assert "intrinsics" in warning

@@ -48,6 +48,7 @@ def test_a_number_is_written_in_its_unit() -> None:
         ("filter/ess/step_03", "filter/ess"),
         ("val/belief/coverage_90", "belief/distance_coverage_90"),
         ("belief/coverage_50", "belief/distance_coverage_50"),
+        ("val/apparent_size/ratio", "scale_ratio/ratio"),
     ],
 )
 def test_every_way_to_write_a_key_leads_to_its_metric(key: str, known: str) -> None:
@@ -90,6 +91,15 @@ def test_numbers_are_read_by_earlier_names() -> None:
     assert rename_key("val/belief/coverage_50") == "val/belief/distance_coverage_50"
     assert rename_key("credibility/coverage_50") == "credibility/coverage_50"
     assert rename_key("val/belief/distance_coverage_50") == "val/belief/distance_coverage_50"
+
+
+def test_numbers_below_an_earlier_name_are_read_by_it() -> None:
+    old, new = {"apparent_size": {"ratio": 1.25}}, {"scale_ratio": {"ratio": 0.8}}
+    assert read_number(old, "scale_ratio/ratio") == 1.25
+    assert read_number(old | new, "scale_ratio/ratio") == 0.8
+    assert read_number(old, "scale_ratio/images") is None
+    assert rename_key("val/apparent_size/images") == "val/scale_ratio/images"
+    assert rename_key("apparent_sizes/images") == "apparent_sizes/images"
 
 
 def test_better_is_the_way_that_a_better_filter_goes() -> None:

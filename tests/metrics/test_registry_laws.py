@@ -16,7 +16,7 @@ WITHIN_ONE = r"iou$|auroc"  # from 0 to 1
 WITHIN_SIGNED_ONE = r"cosine$|heading$"  # from -1 to 1; R² has no least
 COUNTS = (
     "instances", "missed", "confidence/frames", "confidence/frames_without",
-    "confidence/false_alarms", "apparent_size/images", "apparent_size/contradicting",
+    "confidence/false_alarms", "scale_ratio/images", "scale_ratio/contradicting",
     "training/steps", "training/tested_step", "not_finite",
 )  # fmt: skip
 
@@ -66,8 +66,7 @@ def test_the_digits_are_those_that_mean_something(info: MetricInfo) -> None:
     elif info.limits and info.limits[1] < 2:
         assert info.format(0.5) in ("0.50", "0.500")
     elif (
-        info.key
-        in ("belief/rank", "belief/entropy", "apparent_size/ratio", "diagnostics/offset_r2")
+        info.key in ("belief/rank", "belief/entropy", "scale_ratio/ratio", "diagnostics/offset_r2")
         or "log_density" in info.key
     ):
         assert info.format(0.5) == "0.50"

@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from posefilter.cli import run_command
-from posefilter.metrics.apparent_size import ApparentSizes
+from posefilter.metrics.scale_ratio import ScaleRatios
 
 HOME = Path(__file__).parents[2]
 SCENES = HOME / "docs" / "scenes"
@@ -32,7 +32,7 @@ def evaluate(
 @pytest.mark.slow
 def test_depth_of_another_scale_is_told(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     metrics, warnings = evaluate(SCENES, tmp_path / "right", capfd)
-    assert metrics["apparent_size"] == {
+    assert metrics["scale_ratio"] == {
         "images": 6,
         "ratio": pytest.approx(1, abs=0.06),
         "contradicting": 0,
@@ -46,14 +46,14 @@ def test_depth_of_another_scale_is_told(tmp_path: Path, capfd: pytest.CaptureFix
         depth = cv2.imread(path, cv2.IMREAD_UNCHANGED)
         cv2.imwrite(path, np.round(1.25 * depth).astype(depth.dtype))
     metrics, warnings = evaluate(wrong, tmp_path / "wrong", capfd)
-    assert metrics["apparent_size"]["ratio"] == pytest.approx(1.25, rel=0.06)
-    assert metrics["apparent_size"]["contradicting"] > 3
+    assert metrics["scale_ratio"]["ratio"] == pytest.approx(1.25, rel=0.06)
+    assert metrics["scale_ratio"]["contradicting"] > 3
     assert metrics["confidence"]["found"] < 0.5
-    assert [line["ratio"] for line in warnings] == [metrics["apparent_size"]["ratio"]]
+    assert [line["ratio"] for line in warnings] == [metrics["scale_ratio"]["ratio"]]
 
 
 def test_images_that_tell_nothing_are_not_counted() -> None:
-    metric = ApparentSizes()
+    metric = ScaleRatios()
     assert metric.compute() is None
     metric.update(torch.tensor([torch.nan]), torch.tensor([False]))
     assert metric.compute() is None

@@ -10,7 +10,6 @@ import torch
 from tests.tracking.toy import DEPTH, RGB, SPACE, K, make_toy, walk_pose
 
 import posefilter
-from posefilter.confidence.apparent_size import ApparentSize
 from posefilter.confidence.belief_scale import BeliefScale
 from posefilter.confidence.calibration import (
     Assessment,
@@ -431,31 +430,31 @@ def test_wrong_inputs_are_doubted_beyond_the_first_frame(monkeypatch: pytest.Mon
     scales = [1.25]
     measured: list[float] = []
 
-    def measure(*_: Any) -> ApparentSize:
+    def measure(*_: Any) -> ScaleRatio:
         measured.append(scales[0])
-        return ApparentSize(*torch.tensor([[scales[0]], [20.0], [0.9]]))
+        return ScaleRatio(*torch.tensor([[scales[0]], [20.0], [0.9]]))
 
-    monkeypatch.setattr(toy, "measure_apparent_size", measure)
+    monkeypatch.setattr(toy, "measure_scale_ratio", measure)
     tracker = posefilter.Tracker(estimator, TrackerSettings(window_side=64))
     toy.truth = walk_pose(1)[0]
     results = [tracker.update(RGB, DEPTH, K) for _ in range(9)]
-    assert all(one.wrong_size and one.apparent_size == 1.25 for one in results)
+    assert all(one.wrong_size and one.scale_ratio == 1.25 for one in results)
     assert len(measured) == 3  # at first, and in frames with the whole image
     scales[0] = math.nan  # what is not known there is what was known
     assert all(tracker.update(RGB, DEPTH, K).wrong_size for _ in range(4))
     scales[0] = 1.0
     assert not [tracker.update(RGB, DEPTH, K) for _ in range(4)][-1].wrong_size
     count = len(measured)
-    assert [tracker.update(RGB, DEPTH, K).apparent_size for _ in range(5)] == [1.0] * 5
+    assert [tracker.update(RGB, DEPTH, K).scale_ratio for _ in range(5)] == [1.0] * 5
     assert len(measured) == count  # not where nothing is wrong
     scales[0], toy.truth = 0.7, None
     lost = [tracker.update(RGB, DEPTH, K) for _ in range(6)][-1]
     toy.truth = walk_pose(1)[0]
     found = [tracker.update(RGB, DEPTH, K) for _ in range(4)]
     assert (lost.status, found[-1].status) == ("lost", "tracked")
-    assert found[-1].apparent_size == pytest.approx(0.7)
+    assert found[-1].scale_ratio == pytest.approx(0.7)
     tracker.reset()
-    assert tracker.tracks[0].apparent_size is None
+    assert tracker.tracks[0].scale_ratio is None
 
 
 def test_later_frames_may_be_covered_and_cameras_be_of_any_kind() -> None:

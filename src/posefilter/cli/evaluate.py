@@ -34,7 +34,6 @@ from posefilter.data.loaders import make_loader
 from posefilter.data.module import PoseDataModule
 from posefilter.errors import UserError
 from posefilter.geometry.boxes import box_of_pose
-from posefilter.metrics.apparent_size import describe_mismatch
 from posefilter.metrics.bop import BopErrors
 from posefilter.metrics.bop_results import read_poses_csv, to_mesh, write_poses_csv
 from posefilter.metrics.bop_targets import Target, read_targets
@@ -43,6 +42,7 @@ from posefilter.metrics.errors import add
 from posefilter.metrics.image_errors import FILE as ERRORS
 from posefilter.metrics.image_errors import ImageError, write_errors
 from posefilter.metrics.results import compute_checkpoint_score
+from posefilter.metrics.scale_ratio import describe_mismatch
 from posefilter.models.base import PoseEstimator
 from posefilter.models.evaluation import judge_confidence
 from posefilter.paths import check_links, find_conf
@@ -72,7 +72,7 @@ def evaluate(job: Job) -> float:
     metrics, files = _of_estimates(job) if job.cfg.estimates else _of_checkpoint(job)
     write_json(job.folder / "metrics.json", {**metrics, "command": "evaluate"})
     files = {"metrics": job.folder / "metrics.json", **files}
-    size = metrics.get("apparent_size") or {}
+    size = metrics.get("scale_ratio") or {}
     mismatch = describe_mismatch(size, metrics["data"]["root"])
     if mismatch:
         warn(job.cfg.console, mismatch, **size)

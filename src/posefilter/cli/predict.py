@@ -54,7 +54,7 @@ _PROBABILITY = (
 _TOLD = (
     "object", "instance", "verdict", "probability", "presence", "probability_is", "pose_tolerance",
     "probability_within", "costs", "camera_from_object", "rotation", "translation_mm", "score",
-    "score_is", "warnings", "apparent_size", "belief", "belief_file", "visible_pixels", "seconds",
+    "score_is", "warnings", "scale_ratio", "belief", "belief_file", "visible_pixels", "seconds",
     "frame", "checkpoint", "rgb", "depth",
 )  # fmt: skip
 _SURFACE = PoseTolerance(add_s=0.1)
@@ -281,7 +281,7 @@ def describe(
         "translation_mm": None if absent else (1000 * pose[:3, 3]).tolist(),
         "score": result.score,
         "warnings": list(result.warnings),
-        "apparent_size": None if math.isnan(result.apparent_size) else result.apparent_size,
+        "scale_ratio": None if math.isnan(result.scale_ratio) else result.scale_ratio,
         "belief": describe_belief(result),
         "belief_file": str(belief_file),
         "visible_pixels": None if result.mask is None else int(result.mask.sum()),

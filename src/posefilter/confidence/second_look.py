@@ -91,7 +91,7 @@ def _rank(method: Any, calibration: Calibration, trace: Trace, batch: Batch) -> 
 
 def _contradicts(method: Any, trace: Trace, batch: Batch) -> Tensor:
     """Return of which images the object appears in another size than it has, (B,) bool."""
-    size = method.measure_apparent_size(trace, batch)
+    size = method.measure_scale_ratio(trace, batch)
     if size is None:
         return torch.zeros(len(batch.rgb), dtype=torch.bool, device=batch.rgb.device)
     return size.contradicts()

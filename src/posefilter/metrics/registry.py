@@ -216,10 +216,10 @@ _METRICS = (
         meaning="of the frames with the object"),
     _count("confidence/false_alarms", "false alarms", LOWER,
         meaning="frames without the object in which one is found"),
-    _count("apparent_size/images", "images with a measured scale ratio"),
-    MetricInfo("apparent_size/ratio", "scale ratio of depth to mesh", form=".2f",
-        meaning="median apparent size of the object: 1 where depth and intrinsics are right"),
-    _count("apparent_size/contradicting", "images with a scale mismatch", LOWER,
+    _count("scale_ratio/images", "images with a measured scale ratio"),
+    MetricInfo("scale_ratio/ratio", "scale ratio of depth to mesh", form=".2f",
+        meaning="median over the images: 1 where depth and intrinsics are right"),
+    _count("scale_ratio/contradicting", "images with a scale mismatch", LOWER,
         meaning="between depth and mesh: there depth or intrinsics cannot be right"),
     # where particles that are pixels are; lists over the iterations
     _share("diagnostics/on_object", "on the object", HIGHER),
@@ -268,12 +268,13 @@ _METRICS = (
     _count("not_finite", "training scalars that are no numbers", LOWER),
 )  # fmt: skip
 METRICS = {info.key: info for info in _METRICS}
-_RENAMED = {  # keys of files that earlier versions wrote, and tags that they logged
+_RENAMED = {  # keys of files that earlier versions wrote, or their first levels, and tags
     "train/loss_chosen": "train/loss_main",
     "speed/waiting_share": "speed/waiting_fraction",
     "speed/drawing_share": "speed/drawing_fraction",
     "belief/coverage_50": "belief/distance_coverage_50",
     "belief/coverage_90": "belief/distance_coverage_90",
+    "apparent_size": "scale_ratio",
 }
 
 
@@ -281,7 +282,9 @@ def rename_key(key: str) -> str:
     """Return a number's key, or the tag of a logged scalar, as it is called today."""
     split = re.match(r"(?:val|test)/", key)
     start = split.end() if split else 0
-    return key[:start] + _RENAMED.get(key[start:], key[start:])
+    bare = key[start:]
+    old = next((one for one in _RENAMED if bare == one or bare.startswith(f"{one}/")), None)
+    return key if old is None else key[:start] + _RENAMED[old] + bare.removeprefix(old)
 
 
 def find_metric(key: str) -> MetricInfo:
@@ -314,8 +317,12 @@ def read_number(metrics: Mapping[str, Any], key: str) -> float | None:
     Returns:
         The number, None where the file has none or it is not finite.
     """
-    keys = (key, *(old for old, new in _RENAMED.items() if new == key))
-    return next((x for one in keys if (x := _read(metrics, one)) is not None), None)
+    before = (
+        old + key.removeprefix(new)
+        for old, new in _RENAMED.items()
+        if key == new or key.startswith(f"{new}/")
+    )
+    return next((x for one in (key, *before) if (x := _read(metrics, one)) is not None), None)
 
 
 def _read(metrics: Mapping[str, Any], key: str) -> float | None:

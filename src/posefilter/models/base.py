@@ -19,10 +19,10 @@ from torch.optim import Optimizer
 from torch.optim.lr_scheduler import LRScheduler
 
 from posefilter.capabilities import Capabilities, check_parts, collect_provided
-from posefilter.confidence.apparent_size import ApparentSize
 from posefilter.confidence.belief_scale import calibrate_belief
 from posefilter.confidence.calibration import Assessment, Calibration
 from posefilter.confidence.features import measure_belief, measure_depth, measure_print
+from posefilter.confidence.scale_ratio import ScaleRatio
 from posefilter.confidence.second_look import look_again
 from posefilter.confidence.tolerance import RIGHT
 from posefilter.confidence.verdicts import Costs
@@ -266,7 +266,7 @@ class PoseEstimator(Module):
 
         return score
 
-    def measure_apparent_size(self, trace: Trace, batch: Batch) -> ApparentSize | None:
+    def measure_scale_ratio(self, trace: Trace, batch: Batch) -> ScaleRatio | None:
         """Return how large the object appears, relative to its mesh; None where the method cannot
         tell.  Arguments as of `collect_features`.
         """

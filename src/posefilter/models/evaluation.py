@@ -6,9 +6,9 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor, nn
 
-from posefilter.confidence.apparent_size import ApparentSize
 from posefilter.confidence.blank import find_blank
 from posefilter.confidence.calibration import Assessment
+from posefilter.confidence.scale_ratio import ScaleRatio
 from posefilter.confidence.tolerance import measure_pose_errors
 from posefilter.confidence.verdicts import Costs, score_verdicts
 from posefilter.geometry.boxes import box_of_pose
@@ -21,7 +21,6 @@ if TYPE_CHECKING:
 def make_metrics(object_model: ObjectModel, capabilities: Set[str]) -> dict[str, nn.Module]:
     """Create the metrics of an object, by name, for a method that has some capabilities."""
     # torchmetrics: prediction needs none
-    from posefilter.metrics.apparent_size import ApparentSizes
     from posefilter.metrics.bop import BopErrors
     from posefilter.metrics.collect import (
         BeliefQuality,
@@ -33,6 +32,7 @@ def make_metrics(object_model: ObjectModel, capabilities: Set[str]) -> dict[str,
     from posefilter.metrics.confidence import Confidence
     from posefilter.metrics.credibility import Credibility
     from posefilter.metrics.parts import PartIoU
+    from posefilter.metrics.scale_ratio import ScaleRatios
 
     metrics: dict[str, nn.Module] = {
         "iou": BoxIoU(),
@@ -45,7 +45,7 @@ def make_metrics(object_model: ObjectModel, capabilities: Set[str]) -> dict[str,
         metrics["belief"] = BeliefQuality(object_model)
         metrics["credibility"] = Credibility()
         metrics["confidence"] = Confidence()
-        metrics["apparent_size"] = ApparentSizes()
+        metrics["scale_ratio"] = ScaleRatios()
         if object_model.parts:
             metrics["parts"] = PartIoU(object_model)
     return metrics
@@ -89,7 +89,7 @@ def update_metrics(method: "PoseEstimator", trace: Trace, batch: Batch) -> Belie
 def judge_confidence(
     method: "PoseEstimator", trace: Trace, batch: Batch, present: bool
 ) -> Assessment | None:
-    """Add a batch's probabilities, where the method is calibrated, and apparent sizes, where it can
+    """Add a batch's probabilities, where the method is calibrated, and scale ratios, where it can
     tell them, to its metrics; return the probabilities.
 
     Args:
@@ -99,11 +99,11 @@ def judge_confidence(
         present: Whether the object is in them; if not, the batch's poses are not used.
     """
     count = len(batch.rgb)
-    size = method.measure_apparent_size(trace, batch)
-    if present and "apparent_size" in method.scores:
+    size = method.measure_scale_ratio(trace, batch)
+    if present and "scale_ratio" in method.scores:
         unknown = torch.full((count,), torch.nan)
         columns = (unknown, unknown) if size is None else (size.scale, size.contradicts())
-        method.scores["apparent_size"].update(*columns)
+        method.scores["scale_ratio"].update(*columns)
     assessment = method.assess(trace, batch)
     if assessment is None:
         return None
@@ -123,7 +123,7 @@ def judge_confidence(
 
 
 def choose_verdicts(
-    assessment: Assessment, costs: Costs, size: ApparentSize | None, batch: Batch
+    assessment: Assessment, costs: Costs, size: ScaleRatio | None, batch: Batch
 ) -> Tensor:
     """Return the verdicts as a result has them: 1 found, 0 unsure, -1 absent; (B,)."""
     verdict = score_verdicts(assessment, costs)
@@ -167,6 +167,6 @@ def compute_metrics(method: "PoseEstimator") -> dict[str, Any]:
     out["confidence"] = None if method.calibration is None else compute("confidence")
     if out["confidence"] is not None:
         out["confidence"]["pose_tolerance"] = method.pose_tolerance.describe()
-    for name in ("credibility", "by_visibility", "apparent_size", "parts"):
+    for name in ("credibility", "by_visibility", "scale_ratio", "parts"):
         out[name] = compute(name)
     return out

@@ -6,8 +6,9 @@ from typing import Any, ClassVar
 from torch import Generator, Tensor
 
 from posefilter.capabilities import Capabilities, read_declared
-from posefilter.confidence.apparent_size import ApparentSize, measure_apparent_size
+from posefilter.confidence.scale_ratio import ScaleRatio, measure_scale_ratio
 from posefilter.confidence.features import measure_coordinates
+from posefilter.confidence.scale_ratio import ScaleRatio, measure_scale_ratio
 from posefilter.errors import UserError
 from posefilter.geometry.spaces import PoseSpace
 from posefilter.models.base import PoseEstimator
@@ -64,11 +65,11 @@ class PoseParticles(PoseEstimator):
             return features
         return features | measure_coordinates(*self._see_estimate(trace, batch))
 
-    def measure_apparent_size(self, trace: Trace, batch: Batch) -> ApparentSize | None:
+    def measure_scale_ratio(self, trace: Trace, batch: Batch) -> ScaleRatio | None:
         """Return how large the object appears by such a network; None without one."""
         if self._coordinate_net is None:
             return None
-        return measure_apparent_size(*self._see_estimate(trace, batch))
+        return measure_scale_ratio(*self._see_estimate(trace, batch))
 
     def _see_estimate(
         self, trace: Trace, batch: Batch

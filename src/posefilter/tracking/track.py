@@ -10,7 +10,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from posefilter.confidence.apparent_size import ApparentSize
 from posefilter.confidence.calibration import Assessment
 from posefilter.confidence.features import measure_hidden
 from posefilter.confidence.tolerance import RIGHT, PoseTolerance
@@ -139,7 +138,7 @@ class TrackSnapshot(NamedTuple):
     state: State | None
     loss_detector: TrackLossDetector
     frames: int
-    apparent_size: ApparentSize | None
+    scale_ratio: ScaleRatio | None
     rotation_margin: Tensor | None
 
 
@@ -151,7 +150,7 @@ class FrameEstimate(NamedTuple):
     objectness: float = 0.0  # the mean objectness of the pixels that the estimate covers
     presence: float = 0.0  # what the track is judged by
     found: Assessment | None = None  # the calibrated probabilities
-    size: ApparentSize | None = None  # where it was measured
+    size: ScaleRatio | None = None  # where it was measured
 
 
 class Track:
@@ -200,7 +199,7 @@ class Track:
         self.state: State | None = None
         self.loss_detector = TrackLossDetector(self.settings)
         self.frames = 0
-        self.apparent_size: ApparentSize | None = None  # as last measured
+        self.scale_ratio: ScaleRatio | None = None  # as last measured
         self.rotation_margin: Tensor | None = None  # likewise, (1,)
 
     @property
@@ -249,12 +248,12 @@ class Track:
             if lost or sight.presence < self.settings.lost_below:
                 predicted = self._look_behind(predicted, sight)
         trusted, status = self.loss_detector.judge(sight.presence)
-        self.apparent_size = self.apparent_size if sight.size is None else sight.size
+        self.scale_ratio = self.scale_ratio if sight.size is None else sight.size
         if sight.found is not None and sight.found.features is not None:
             self.rotation_margin = sight.found.features.get("rotation_margin")
         if status != LOST and sight.belief is not None:
             # inputs that are wrong stay so in frames that do not measure it
-            sight = sight._replace(size=self.apparent_size)
+            sight = sight._replace(size=self.scale_ratio)
         belief = sight.belief if trusted or predicted is None else None
         self.state = self._correct(predicted, belief, status)
         self.frames += 1
@@ -289,7 +288,7 @@ class Track:
     def _estimate(self, batch: Batch) -> FrameEstimate:
         """Run the estimator's own filter on the whole image."""
         trace = self.method.predict_step(batch, 0)
-        size = self.method.measure_apparent_size(trace, batch)
+        size = self.method.measure_scale_ratio(trace, batch)
         return self._weigh(batch, trace, with_margin=True)._replace(size=size)
 
     def _follow(self, batch: Batch, predicted: State, windowed: bool) -> FrameEstimate:
@@ -313,7 +312,7 @@ class Track:
         due = self._margin_is_due
         found, trace = self._filter(batch, encoding, start, follow, refine, against, due)
         if not windowed and self._has_wrong_size:  # the inputs may be right now, or have been
-            size = self.method.measure_apparent_size(trace, batch)
+            size = self.method.measure_scale_ratio(trace, batch)
             if size is not None and bool(size.scale.isfinite().all()):
                 return found._replace(size=size)
         return found
@@ -332,7 +331,7 @@ class Track:
         # as in a single image: the frame before does not tell how the object is turned
         refine = self._refine(settings.quadratic_fits, self._texture_rotations)
         found, trace = self._filter(batch, encoding, start, search, refine, with_margin=True)
-        return found._replace(size=self.method.measure_apparent_size(trace, batch))
+        return found._replace(size=self.method.measure_scale_ratio(trace, batch))
 
     def _look_behind(self, predicted: State, sight: FrameEstimate) -> State:
         """Return the state of an object that is not seen, with how it was lost from sight.
@@ -473,7 +472,7 @@ class Track:
 
     @property
     def _has_wrong_size(self) -> bool:
-        return self.apparent_size is not None and bool(self.apparent_size.contradicts().any())
+        return self.scale_ratio is not None and bool(self.scale_ratio.contradicts().any())
 
     @property
     def _whole_is_due(self) -> bool:

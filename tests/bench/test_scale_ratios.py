@@ -1,4 +1,4 @@
-"""The bench of apparent sizes counts what its columns are named for."""
+"""The bench of scale ratios counts what its columns are named for."""
 
 import dataclasses
 from collections.abc import Callable
@@ -13,7 +13,7 @@ from posefilter.data.frames import Sample
 
 @pytest.fixture
 def bench(load_script: Callable[[str], ModuleType]) -> ModuleType:
-    return load_script("bench/apparent_sizes.py")
+    return load_script("bench/scale_ratios.py")
 
 
 SAMPLE = Sample(
@@ -47,7 +47,7 @@ class Believing:
             probability=0.9,
             costs=None,
             pose_tolerance=None,
-            apparent_size=factor if self.measures else np.nan,
+            scale_ratio=factor if self.measures else np.nan,
             wrong_size=self.measures and factor != 1,
         )
 

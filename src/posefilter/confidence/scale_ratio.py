@@ -31,7 +31,7 @@ _LEAST_GAIN = 8.0  # of the gain: it counts cells as independent, which neighbor
 _EXPLAINED = 0.5  # share, below which the network and the estimate do not tell of one object
 
 
-class ApparentSize(NamedTuple):
+class ScaleRatio(NamedTuple):
     """The scale of measured over known distances on the object, of each image."""
 
     scale: Tensor  # (B,) the most likely; nan where too few cells show the object
@@ -46,12 +46,12 @@ class ApparentSize(NamedTuple):
 
 # of estimates, as long as those are there: the output of the network that it was measured by, and
 # the size, which is asked for when an answer is chosen and again for the result
-_KNOWN: MutableMapping[Tensor, tuple[weakref.ref[Tensor], ApparentSize]] = WeakIdKeyDictionary()
+_KNOWN: MutableMapping[Tensor, tuple[weakref.ref[Tensor], ScaleRatio]] = WeakIdKeyDictionary()
 
 
-def measure_apparent_size(
+def measure_scale_ratio(
     best: Tensor, coordinates: Coordinates, cells: Cells, object_model: ObjectModel
-) -> ApparentSize:
+) -> ScaleRatio:
     """Measure how large the object appears, by the profile likelihood of the scale.
 
     At each scale s the object's points X lie at t + s R X. R is the estimate's. t, and which
@@ -70,7 +70,7 @@ def measure_apparent_size(
     found = [
         _measure(best[i], _seen(coordinates, cells, i), object_model) for i in range(len(best))
     ]
-    size = ApparentSize(*(torch.stack(part) for part in zip(*found, strict=True)))
+    size = ScaleRatio(*(torch.stack(part) for part in zip(*found, strict=True)))
     _KNOWN[best] = weakref.ref(coordinates.logit), size
     return size
 

@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from posefilter.confidence.apparent_size import ApparentSize, measure_apparent_size
+from posefilter.confidence.scale_ratio import ScaleRatio, measure_scale_ratio
 from posefilter.geometry.pose import make_pose, transform
 from posefilter.geometry.rotation import exp_so3
 from posefilter.nets.coordinates import Cells, Coordinates
@@ -51,11 +51,11 @@ def look(
     return seen, Cells(points.view(1, *GRID, 3), known, torch.zeros(1, *GRID, 2))
 
 
-def measure(seen: tuple[Coordinates, Cells], stretch: Tensor | None = None) -> ApparentSize:
+def measure(seen: tuple[Coordinates, Cells], stretch: Tensor | None = None) -> ScaleRatio:
     """Measure from a pose whose center went with the measured points."""
     pose = POSE.clone()
     pose[:, :3, 3] *= torch.ones(3) if stretch is None else stretch
-    return measure_apparent_size(pose, *seen, MODEL)
+    return measure_scale_ratio(pose, *seen, MODEL)
 
 
 @pytest.mark.parametrize("factor", [0.7, 0.8, 1.0, 1.25, 1.5])
@@ -99,7 +99,7 @@ def test_a_batch_is_its_images() -> None:
         Coordinates(*(torch.cat(pair) for pair in zip(large[0], plain[0], strict=True))),
         Cells(*(torch.cat(pair) for pair in zip(large[1], plain[1], strict=True))),
     )
-    together = measure_apparent_size(POSE.expand(2, 4, 4), *both, MODEL)
+    together = measure_scale_ratio(POSE.expand(2, 4, 4), *both, MODEL)
     for i, one in enumerate((large, plain)):
         alone = measure(one)
         assert [float(x[i]) for x in together] == pytest.approx([float(x[0]) for x in alone])
@@ -107,10 +107,10 @@ def test_a_batch_is_its_images() -> None:
 
 def test_an_estimate_is_measured_once_by_each_output_of_a_network() -> None:
     pose, seen, other = POSE.clone(), look(torch.ones(3)), look(torch.full((3,), 1.25))
-    first = measure_apparent_size(pose, *seen, MODEL)
-    assert measure_apparent_size(pose, *seen, MODEL) is first
-    changed = measure_apparent_size(pose, *other, MODEL)
+    first = measure_scale_ratio(pose, *seen, MODEL)
+    assert measure_scale_ratio(pose, *seen, MODEL) is first
+    changed = measure_scale_ratio(pose, *other, MODEL)
     assert float(changed.scale) != float(first.scale)
-    again = measure_apparent_size(POSE.clone(), *seen, MODEL)
+    again = measure_scale_ratio(POSE.clone(), *seen, MODEL)
     assert again is not first
     assert torch.equal(again.scale, first.scale)

@@ -1,6 +1,6 @@
-"""How well the apparent size tells a wrong depth scale, on held-out renders.
+"""How well the scale ratio tells a wrong depth scale, on held-out renders.
 
-    python bench/apparent_sizes.py --root DIR --meshes DIR [--only NAME ...] [--images 12]
+    python bench/scale_ratios.py --root DIR --meshes DIR [--only NAME ...] [--images 12]
 
 The scenes are those that bench/held_out.py tests on. Each image is asked as it is, and with depths
 1.25 and 0.8 times as large: of those whose pose is right as they are, how many are said to be of a
@@ -44,7 +44,7 @@ def ask(estimator: posefilter.Estimator, sample: Sample) -> list[dict[str, Any]]
         assert result.presence is not None
         assert result.probability is not None
         probable = decide(result.presence, result.probability, result.costs) == "found"
-        size, noticed = result.apparent_size, result.wrong_size
+        size, noticed = result.scale_ratio, result.wrong_size
         out.append({"size": size, "noticed": noticed, "wrong": probable and not right})
     return out
 
@@ -79,7 +79,7 @@ def main() -> None:
         answers = [ask(estimator, sample) for _, sample in frames]
         rows.append(tabulate(name, [one for one in answers if one is not None]))
         print(rows[-1], flush=True)
-    PAGE.write_text(put_table(PAGE.read_text(), "apparent-sizes", HEAD, rows))
+    PAGE.write_text(put_table(PAGE.read_text(), "scale-ratios", HEAD, rows))
 
 
 if __name__ == "__main__":

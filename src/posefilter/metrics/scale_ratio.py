@@ -10,26 +10,26 @@ from posefilter.metrics.collect import Rows
 _FEWEST = 3  # images that tell a dataset's scale
 
 
-class ApparentSizeColumns(NamedTuple):
-    """The apparent sizes of N images: (N,) each."""
+class ScaleRatioColumns(NamedTuple):
+    """The scale ratios of N images: (N,) each."""
 
     scale: Tensor  # relative to the mesh
     contradicts: Tensor  # bool; the inputs cannot be right
 
 
-class ApparentSizes(Rows[ApparentSizeColumns]):
-    """The apparent sizes of images that show the object; 1 where the inputs are right.
+class ScaleRatios(Rows[ScaleRatioColumns]):
+    """The scale ratios of images that show the object; 1 where the inputs are right.
 
     images: in how many it could be told. ratio: the median of these. contradicting: in how many of
     them the inputs cannot be right.
     """
 
-    columns = ApparentSizeColumns
+    columns = ScaleRatioColumns
 
     def update(self, scale: Tensor, contradicts: Tensor) -> None:
         """Accumulate images; (B,) with NaN where nothing can be told, and (B,) bool."""
         measured = ~scale.isnan()
-        self.append(ApparentSizeColumns(scale[measured].cpu(), contradicts[measured].cpu()))
+        self.append(ScaleRatioColumns(scale[measured].cpu(), contradicts[measured].cpu()))
 
     def compute(self) -> dict[str, Any] | None:
         """Return the numbers; None where no image tells."""
@@ -47,7 +47,7 @@ def describe_mismatch(size: Mapping[str, Any], root: str) -> str:
     """Return in words that most images show the object in a size that cannot be; "" if not so.
 
     Args:
-        size: What `ApparentSizes` computed, or nothing.
+        size: What `ScaleRatios` computed, or nothing.
         root: The dataset's folder.
     """
     if not size or size["images"] < _FEWEST or 2 * size["contradicting"] <= size["images"]:
