@@ -47,7 +47,7 @@ HEADS = {
     "gpu times": ("what", "CPU ms", "GPU ms", "CPU over GPU"),
 }  # fmt: skip
 PAPER = ("filter.particles=1000", "filter.initial_particles=1000", "filter.steps=100")
-ONCE = ("filter.max_searches=1", "filter.zoom_diameter=null", "filter/refine=none")
+ONCE = ("filter.max_searches=1", "filter.magnified_width=null", "filter/refine=none")
 POSES, POINTS = 1000, 256
 Rows = list[list[str]]
 

@@ -191,7 +191,7 @@ RANGES: dict[str, Range] = {
     # filter
     **dict.fromkeys(("particles", "initial_particles"), _whole(1, 100_000)),
     "filter.steps": _whole(1, 10_000),
-    "filter.zoom_diameter": Range(0, 1, above=True),
+    "filter.magnified_width": Range(0, 1, above=True),
     "depth_offset": Range(-10, 10, many=True),
     **dict.fromkeys(("uniform_fraction", "object_fraction"), SHARE),
     "sigma_px": PIXELS,

@@ -50,7 +50,7 @@ def test_what_is_not_there_is_named(typed: str, told: str, tmp_path: Path) -> No
 
 def test_a_setting_that_earlier_recipes_leave_out_is_taken(tmp_path: Path) -> None:
     assert change("filter.max_searches=1", tmp_path)["filter"]["max_searches"] == 1
-    assert change("filter.zoom_diameter=0.4", tmp_path)["filter"]["zoom_diameter"] == 0.4
+    assert change("filter.magnified_width=0.4", tmp_path)["filter"]["magnified_width"] == 0.4
     with pytest.raises(UserError, match=r"filter\.look: the checkpoint's"):
         change("filter.look=1", tmp_path)
 
@@ -68,9 +68,9 @@ def test_another_class_of_the_method_keeps_what_it_is_made_of(tmp_path: Path) ->
 
 def test_a_calibration_holds_for_fewer_searches_and_for_what_is_left_out() -> None:
     own = {"filter": {"particles": 50, "max_searches": 3}}
-    assert is_calibrated_filter({"filter": {"particles": 50, "zoom_diameter": None}}, own)
+    assert is_calibrated_filter({"filter": {"particles": 50, "magnified_width": None}}, own)
     assert is_calibrated_filter({"filter": {"particles": 50, "max_searches": 1}}, own)
-    others: list[dict[str, Any]] = [{"max_searches": 4}, {"zoom_diameter": 0.4}, {"particles": 9}]
+    others: list[dict[str, Any]] = [{"max_searches": 4}, {"magnified_width": 0.4}, {"particles": 9}]
     for other in others:
         assert not is_calibrated_filter({"filter": {"particles": 50, **other}}, own)
     assert is_calibrated_filter({"model": 1}, {"model": 1})

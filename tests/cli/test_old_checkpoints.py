@@ -55,6 +55,8 @@ OLD = {
         },
     },
     "filter": {
+        "_target_": "posefilter.filters.loop.ParticleFilter",
+        "zoom_diameter": 0.4,
         "resample": {"_target_": "posefilter.filters.transport.OptimalTransport"},
         "reweight": {"_target_": "posefilter.filters.reweight.Annealed"},
         "schedule": {"_target_": "posefilter.filters.schedule.Geometric", "start": 4, "stop": 1},
@@ -98,6 +100,8 @@ NEW = {
         },
     },
     "filter": {
+        "_target_": "posefilter.filters.loop.ParticleFilter",
+        "magnified_width": 0.4,
         "resample": {"_target_": "posefilter.filters.transport.SampledTransport"},
         "reweight": {"_target_": "posefilter.filters.reweight.CurrentLikelihood"},
         "schedule": {
@@ -138,11 +142,18 @@ def test_an_old_recipe_is_read_by_todays_names() -> None:
     }
 
 
-@pytest.mark.parametrize(("setting", "old", "new"), [("model", "train_filter", "train_rollout")])
+@pytest.mark.parametrize(
+    ("setting", "old", "new"),
+    [
+        ("model", "train_filter", "train_rollout"),
+        ("filter", "zoom_diameter", "magnified_width"),
+        ("filter", "first_particles", "initial_particles"),
+    ],
+)
 def test_a_class_of_ones_own_has_the_arguments_of_its_base(
     setting: str, old: str, new: str
 ) -> None:
-    own = {"_target_": "ownpf.method.Own", "looks": 1}
+    own = {"_target_": "ownpf.method.Own", "seed": 1}
     found = check_recipe({"choices": {}, "settings": {setting: own | {old: None}}})
     assert found["settings"] == {setting: own | {new: None}}
 

@@ -52,10 +52,12 @@ def test_a_costly_stage_is_not_begun_anew(tmp_path: Path) -> None:
 
 def test_settings_of_a_record_have_the_names_of_today(tmp_path: Path) -> None:
     file = tmp_path / "record.json"
-    before = {"clutter": "builtin", "clutter_scale": None, "settings": ["filter.particles=8"]}
+    typed = ["filter.particles=8", "filter.zoom_diameter=0.3"]
+    before = {"clutter": "builtin", "clutter_scale": None, "settings": typed}
     stage = {"done": True, "settings": before, "seconds": 1.5}
     file.write_text(json.dumps({"stages": {"render": stage}, "values": {}}))
-    now = {"distractor_meshes": "builtin", "train_overrides": ["filter.particles=8"]}
+    words = ["filter.particles=8", "filter.magnified_width=0.3"]
+    now = {"distractor_meshes": "builtin", "train_overrides": words}
     assert Stages(file).is_done("render", {**now, "distractor_scale": None})
 
 

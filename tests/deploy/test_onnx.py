@@ -82,12 +82,16 @@ def pixels(poses: ModuleType, load_script: Callable[[str], ModuleType]) -> Modul
 
 @pytest.fixture(scope="module")
 def estimator() -> posefilter.Estimator:
-    return posefilter.load("003_cracker_box", device="cpu", overrides=["filter.zoom_diameter=null"])
+    return posefilter.load(
+        "003_cracker_box", device="cpu", overrides=["filter.magnified_width=null"]
+    )
 
 
 @pytest.fixture(scope="module")
 def zoomed() -> posefilter.Estimator:
-    return posefilter.load("003_cracker_box", device="cpu", overrides=["filter.zoom_diameter=0.4"])
+    return posefilter.load(
+        "003_cracker_box", device="cpu", overrides=["filter.magnified_width=0.4"]
+    )
 
 
 @pytest.fixture(scope="module")

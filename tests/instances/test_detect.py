@@ -57,7 +57,7 @@ class SimpleFilter:
     """What the search needs of a filter."""
 
     particles = initial_particles = 8
-    zoom_diameter = None
+    magnified_width = None
     resample: Resample = Systematic()
 
     def __call__(self, batch: Batch, method: Any, generator: Generator) -> Any:

@@ -507,8 +507,12 @@ def test_fewer_looks_keep_the_calibration() -> None:
     assert result.probability is not None
     assert 0 <= result.probability <= result.presence
     assert once.methods[0].calibration is not None
-    assert once.methods[0].filter.zoom_diameter == 0.4  # of the file
-    for other in ("filter.max_searches=4", "filter.zoom_diameter=null", "filter.zoom_diameter=0.3"):
+    assert once.methods[0].filter.magnified_width == 0.4  # of the file
+    for other in (
+        "filter.max_searches=4",
+        "filter.magnified_width=null",
+        "filter.magnified_width=0.3",
+    ):
         changed = posefilter.load("003_cracker_box", overrides=[other], device="cpu").methods[0]
         assert changed.calibration is None
         assert "calibrated for another filter" in changed.calibration_note

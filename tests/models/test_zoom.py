@@ -49,7 +49,7 @@ class Seeker:
     space = PoseSpace((0.0, 0.0, 0.0), 0.05)
     latent_width = 0
 
-    def __init__(self, zoom_diameter: float | None, apart: float = 0.0) -> None:
+    def __init__(self, magnified_width: float | None, apart: float = 0.0) -> None:
         self.seen: list[Batch] = []
         self.steps: list[int] = []
         self.apart = apart
@@ -64,7 +64,7 @@ class Seeker:
             estimate=Mean(),
             refine=NoRefine(),
             initial_particles=60,
-            zoom_diameter=zoom_diameter,
+            magnified_width=magnified_width,
         )
 
     def encode(self, batch: Batch) -> Tensor:

@@ -180,7 +180,8 @@ def is_calibrated_filter(settings: dict[str, Any], calibrated: dict[str, Any]) -
 
     def split(one: dict[str, Any]) -> tuple[dict[str, Any], int]:
         own = one.get("filter")
-        own = {"zoom_diameter": None, **own} if isinstance(own, dict) else {}  # as earlier recipes
+        # earlier recipes leave it out
+        own = {"magnified_width": None, **own} if isinstance(own, dict) else {}
         searches = own.pop("max_searches", MAX_SEARCHES)
         return {**one, "filter": own}, searches if isinstance(searches, int) else MAX_SEARCHES
 

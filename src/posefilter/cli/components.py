@@ -10,7 +10,7 @@ from posefilter.errors import UserError
 
 SECTIONS = ("filter", "model")
 # settings that recipes of earlier versions leave out
-_LATER = ("filter.max_searches", "filter.zoom_diameter")
+_LATER = ("filter.max_searches", "filter.magnified_width")
 LOOSE = ("evaluate", "predict", "track", "convert_bag", "export", "calibrate")
 
 

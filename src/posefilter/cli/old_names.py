@@ -71,8 +71,9 @@ data: points > num_model_points, model_points > model_points_dir
 data.generate: occlusion > max_occlusion, occluded_share > occluded_fraction,
     tabletop_share > tabletop_fraction, absent_share > absent_fraction,
     covered_frames > fully_occluded_frames
-filter: looks > max_searches, first_particles > initial_particles
-model.train_rollout: first_particles > initial_particles
+filter: looks > max_searches, first_particles > initial_particles,
+    zoom_diameter > magnified_width
+model.train_rollout: first_particles > initial_particles, zoom_diameter > magnified_width
 tracker: walk > noise_scale, move_scale > noise_scale, kld_cell > kld_bin_size,
     jump > jump_penalty, epsilon > kld_epsilon, quantile > kld_quantile, cell > kld_bin_size,
     look_around > whole_image_every, side > window_side, reach > window_scale,
@@ -179,7 +180,8 @@ CLASSES = {
 }
 # arguments of classes, by today's place of the class below posefilter
 ARGUMENTS = _read("""
-filters.loop.ParticleFilter: looks > max_searches, first_particles > initial_particles
+filters.loop.ParticleFilter: looks > max_searches, first_particles > initial_particles,
+    zoom_diameter > magnified_width
 filters.propagate.Compose: pieces > components
 filters.propagate.Gaussian: factor > noise_scale
 filters.propagate.HalfTurnRotations: share > probability
@@ -231,7 +233,11 @@ callbacks.diagnostics.Diagnostics: share > max_time_fraction
 callbacks.figures.Figures: share > max_time_fraction
 """)
 # base classes, by the setting that holds one of them: one's own class there has their arguments too
-BASES = {"model": "models.base.PoseEstimator"}
+BASES = {
+    "model": "models.base.PoseEstimator",
+    "filter": "filters.loop.ParticleFilter",
+    "train_rollout": "filters.loop.ParticleFilter",
+}
 # values of arguments of classes, likewise
 VALUES = {("synthetic.generate.generate", "lookalike_texture"): CHOICES["lookalike_texture"]}
 # options of the data module, by the reader that takes them

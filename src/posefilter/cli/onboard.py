@@ -147,7 +147,7 @@ class Onboarding:
         quoted |= {"data.meshes": self.out / "meshes"}
         words = [
             "model=pose_pf",
-            "filter.zoom_diameter=0.4",
+            "filter.magnified_width=0.4",
             "filter.max_searches=4",
             "data=scenes",
             "data/augment=camera_magnified",  # as the magnified windows are

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from posefilter.cli.old_names import COMMANDS
+from posefilter.cli.renamed import update
 from posefilter.cli.results import write_json
 from posefilter.errors import UserError
 from posefilter.forms import NUMBER, Each, Record, check_form, parse_json
@@ -43,8 +44,7 @@ class Stages:
                 ) from error
             self._stages, self.values = found["stages"], found["values"]
             for stage in self._stages.values():
-                settings = stage["settings"]
-                stage["settings"] = {_RENAMED.get(key, key): settings[key] for key in settings}
+                stage["settings"] = _with_todays_names(stage["settings"])
 
     @property
     def seconds(self) -> dict[str, float]:
@@ -114,6 +114,15 @@ class Stages:
 
     def _write(self) -> None:
         write_json(self.file, {"stages": self._stages, "values": self.values})
+
+
+def _with_todays_names(settings: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a record's settings by today's names; so are those that the training was given."""
+    named = {_RENAMED.get(key, key): value for key, value in settings.items()}
+    words = named.get("train_overrides")
+    if isinstance(words, list):
+        named["train_overrides"] = [update(str(one), "train") for one in words]
+    return named
 
 
 def _plain(settings: Mapping[str, Any]) -> dict[str, Any]:

@@ -108,10 +108,10 @@ def _choose(component: Any, group: str, **kinds: type) -> str:
 
 def _describe_zoom(own: ParticleFilter) -> dict[str, Any] | None:
     """Return when a magnified window is searched; None: never."""
-    if own.zoom_diameter is None:
+    if own.magnified_width is None:
         return None
     return {
-        "diameter": own.zoom_diameter,  # [widths of the image]
+        "diameter": own.magnified_width,  # [widths of the image]
         "least": LEAST_ZOOM, "most": MOST_ZOOM, "steps": min(STEPS, own.steps),
         "heaviest": HEAVIEST, "agreed": AGREED, "least_depth": LEAST_DEPTH,
     }  # fmt: skip

@@ -82,8 +82,8 @@ class ParticleFilter(nn.Module):
         initial_particles: Number of particles at the first step; `particles` if None.
         max_searches: How often an image is searched at most, while a calibrated answer is doubtful
             (confidence/second_look.py); 1 to 4.
-        zoom_diameter: Where the object is smaller in the image, in widths of the image, a method
-            that estimates poses searches a magnified window in which it has this diameter
+        magnified_width: The object's diameter, in widths of the image, in a magnified window, which
+            a method that estimates poses searches where it is less than that / 1.2 in the image
             (models/zoom.py); None: nowhere.
 
     The filter does not read the last two: it runs once, on the images that it is given. They say
@@ -91,7 +91,7 @@ class ParticleFilter(nn.Module):
     They are arguments of the filter since the recipes of checkpoints hold them with its own.
 
     Raises:
-        UserError: A number is below 1, `max_searches` above 4, or `zoom_diameter` not in (0, 1].
+        UserError: A number is below 1, `max_searches` above 4, or `magnified_width` not in (0, 1].
     """
 
     def __init__(
@@ -107,7 +107,7 @@ class ParticleFilter(nn.Module):
         refine: Refine,
         initial_particles: int | None = None,
         max_searches: int = MAX_SEARCHES,
-        zoom_diameter: float | None = None,
+        magnified_width: float | None = None,
     ) -> None:
         super().__init__()
         first = particles if initial_particles is None else initial_particles
@@ -118,10 +118,10 @@ class ParticleFilter(nn.Module):
             )
         if not 1 <= max_searches <= 4:
             raise UserError(f"filter.max_searches={max_searches}: must be 1, 2, 3 or 4")
-        if zoom_diameter is not None and not 0 < zoom_diameter <= 1:
-            raise UserError(f"filter.zoom_diameter={zoom_diameter}: must be above 0, 1 at most")
+        if magnified_width is not None and not 0 < magnified_width <= 1:
+            raise UserError(f"filter.magnified_width={magnified_width}: must be above 0, 1 at most")
         self.particles, self.steps, self.max_searches = particles, steps, max_searches
-        self.zoom_diameter = zoom_diameter
+        self.magnified_width = magnified_width
         self.initial_particles = first
         self.initialize, self.schedule = initialize, schedule
         self.reweight, self.resample, self.propagate = reweight, resample, propagate

@@ -48,16 +48,16 @@ def with_encoding(method: Any, encoding: Encoding) -> Any:
 
 def check_zoom(method: Any) -> None:
     """Raise UserError where windows are asked of a method or a filter that cannot search them."""
-    if getattr(method.filter, "zoom_diameter", None) is None:
+    if getattr(method.filter, "magnified_width", None) is None:
         return
     if "pose_space" not in method.capabilities:
         raise UserError(
-            "filter.zoom_diameter: needs a method whose particles are poses, such as "
+            "filter.magnified_width: needs a method whose particles are poses, such as "
             f"pose_pf; those of {type(method).__name__} are places in one image"
         )
     if type(method.filter).forward is not ParticleFilter.forward:
         raise UserError(
-            f"filter.zoom_diameter: {type(method.filter).__name__} has a forward() of its "
+            f"filter.magnified_width: {type(method.filter).__name__} has a forward() of its "
             "own, which windows would not run; choose null"
         )
 
@@ -86,7 +86,7 @@ def search(
         searched.
     """
     run = method.filter if particle_filter is None else particle_filter
-    target: float | None = getattr(run, "zoom_diameter", None)
+    target: float | None = getattr(run, "magnified_width", None)
     if target is None:
         return run(
             batch, method if encoding is None else with_encoding(method, encoding), generator
@@ -158,7 +158,7 @@ def find_place(particles: Particles, object_model: ObjectModel) -> tuple[Tensor,
 
 
 def measure_zoom(
-    centers: Tensor, batch: Batch, object_model: ObjectModel, zoom_diameter: float
+    centers: Tensor, batch: Batch, object_model: ObjectModel, magnified_width: float
 ) -> Tensor:
     """Return how much images are magnified for an object at `centers`, (B,): 1 where it is not
     small, not before the camera, or where hardly a pixel about it has depth.
@@ -167,11 +167,11 @@ def measure_zoom(
         centers: (B, 3) of the object, in camera axes [m].
         batch: The images.
         object_model: The object.
-        zoom_diameter: Its diameter after that, in widths of the image.
+        magnified_width: Its diameter after that, in widths of the image.
     """
     z = centers[:, 2]
     diameter = batch.intrinsics[:, 0, 0] * object_model.diameter / z.clamp_min(1e-3)  # [px]
-    zoom = (zoom_diameter * batch.rgb.shape[-1] / diameter).clamp_max(MOST_ZOOM)
+    zoom = (magnified_width * batch.rgb.shape[-1] / diameter).clamp_max(MOST_ZOOM)
     zoom = torch.where((z > 0) & (zoom >= LEAST_ZOOM), zoom, 1.0)
     pixels = project(centers[:, None], batch.intrinsics)[:, 0]
     small = zoom > 1
