@@ -24,8 +24,9 @@ from posefilter.metrics.registry import find_metric, read_number
 
 KEYS = (
     "particles_on_object", "diagnostics/on_object/first", "iou", "add/auc", "add/recall_01d",
-    "add_s/auc", "diagnostics/distinct/last", "diagnostics/pairwise_cosine", "diagnostics/heading",
-    "diagnostics/offset_r2", "diagnostics/off_frame/last", "diagnostics/near_edge/last",
+    "add_s/auc", "diagnostics/distinct/last", "diagnostics/pairwise_cosine",
+    "diagnostics/offset_cosine", "diagnostics/offset_r2", "diagnostics/off_frame/last",
+    "diagnostics/near_edge/last",
     "diagnostics/near_corner/last", "diagnostics/line_share/first", "diagnostics/line_share/last",
     "diagnostics/auroc", "credibility/log_density",
 )  # fmt: skip

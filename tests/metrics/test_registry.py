@@ -44,7 +44,8 @@ def test_a_number_is_written_in_its_unit() -> None:
         ("by_visibility/0.3-0.5/add_s/median_mm", "add_s/median_mm"),
         ("val/by_visibility/0-0.3/instances", "instances"),
         ("diagnostics/off_frame/last", "diagnostics/off_frame"),
-        ("val/diagnostics/heading", "diagnostics/heading"),
+        ("val/diagnostics/offset_cosine", "diagnostics/offset_cosine"),
+        ("val/diagnostics/heading", "diagnostics/offset_cosine"),
         ("filter/ess/step_03", "filter/ess"),
         ("val/belief/coverage_90", "belief/distance_coverage_90"),
         ("belief/coverage_50", "belief/distance_coverage_50"),
@@ -99,6 +100,7 @@ def test_numbers_below_an_earlier_name_are_read_by_it() -> None:
     assert read_number(old | new, "scale_ratio/ratio") == 0.8
     assert read_number(old, "scale_ratio/images") is None
     assert rename_key("val/apparent_size/images") == "val/scale_ratio/images"
+    assert read_number({"diagnostics": {"heading": 0.5}}, "diagnostics/offset_cosine") == 0.5
     assert rename_key("apparent_sizes/images") == "apparent_sizes/images"
 
 

@@ -13,7 +13,7 @@ every = pytest.mark.parametrize("info", METRICS.values(), ids=METRICS.keys())
 
 STORED_AS_PERCENT = r"auc$|recall|/ar$|/ar_|coverage|score$"
 WITHIN_ONE = r"iou$|auroc"  # from 0 to 1
-WITHIN_SIGNED_ONE = r"cosine$|heading$"  # from -1 to 1; R² has no least
+WITHIN_SIGNED_ONE = r"cosine$"  # from -1 to 1; R² has no least
 COUNTS = (
     "instances", "missed", "confidence/frames", "confidence/frames_without",
     "confidence/false_alarms", "scale_ratio/images", "scale_ratio/contradicting",
@@ -88,7 +88,7 @@ def test_which_way_is_better(info: MetricInfo) -> None:
         r"|loss|drop|not_finite"
     )
     better = (
-        r"auc|recall|/ar$|iou|on_object|mass|log_density|auroc|found|distinct|r2|heading"
+        r"auc|recall|/ar$|iou|on_object|mass|log_density|auroc|found|distinct|r2|offset_cosine"
         r"|^(?:best_)?score$|likelihood"
     )
     neither = r"instances|effective|entropy|spread|rank|frames|line_share|steps?$|ess$|sigma"

@@ -94,7 +94,7 @@ def test_with_true_displacements_every_particle_reaches_the_object(
     signs = FilterDiagnostics()
     signs.update(trace, batch)
     found = signs.compute()
-    assert found["heading"] > 0.99
+    assert found["offset_cosine"] > 0.99
     assert found["off_frame"] == [0.0] * 8
     assert found["on_object"][-1] == 1.0
 

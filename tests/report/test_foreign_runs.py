@@ -72,7 +72,9 @@ TAKEN: dict[str, Change] = {
     "other levels": credible(levels=[0.1], all=[0.2], quarters=[{**QUARTER, "coverage": [0.3]}]),
     "nulls": lambda m: dict.fromkeys(m),
     "nulls for lists": credible(levels=None, all=None, quarters=None),
-    "a diagnostic that ends in null": add(diagnostics={"off_frame": [0.5, None], "heading": ["x"]}),
+    "a diagnostic that ends in null": add(
+        diagnostics={"off_frame": [0.5, None], "offset_cosine": ["x"]}
+    ),
     "negative numbers": change_numbers(-1),
     "zeros": change_numbers(0),
     "large numbers": change_numbers(1e30),

@@ -27,7 +27,7 @@ LISTS: dict[str, Color] = {
     "near_corner": (240, 160, 30),
     "line_share": (150, 90, 200),
 }
-NUMBERS = ("pairwise_cosine", "offset_r2", "heading", "auroc")
+NUMBERS = ("pairwise_cosine", "offset_r2", "offset_cosine", "auroc")
 
 
 class Diagnostics(BudgetedCallback):

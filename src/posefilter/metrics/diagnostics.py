@@ -107,10 +107,9 @@ class FilterDiagnostics(Metric):
     step.
 
     Lists: off_frame, near_edge, near_corner, on_object, distinct, line_share. Numbers:
-    pairwise_cosine, the mean over images and steps; offset_r2 and heading (`offset_cosine`), of
-    displacements against the true offset to the mask's nearest pixel; auroc of the likelihood, with
-    particles on the mask as positives and others in the frame as negatives. The last three are over
-    all steps.
+    pairwise_cosine, the mean over images and steps; offset_r2 and offset_cosine, of displacements
+    against the true offset to the mask's nearest pixel; auroc of the likelihood, with particles on
+    the mask as positives and others in the frame as negatives. The last three are over all steps.
 
     Args:
         max_particles: Maximum number of particles of an image and step for the last three.
@@ -166,6 +165,6 @@ class FilterDiagnostics(Metric):
             "line_share": concat_state(self.lines).nanmean(0).tolist(),
             "pairwise_cosine": float(concat_state(self.cosine).nanmean()),
             "offset_r2": float(r2_score(displacement, true)),
-            "heading": float(offset_cosine(displacement, true)),
+            "offset_cosine": float(offset_cosine(displacement, true)),
             "auroc": float(auroc(scored[:, 0], scored[:, 1] > 0)),
         }

@@ -239,7 +239,7 @@ _METRICS = (
     # at most 1, and without a least
     MetricInfo("diagnostics/offset_r2", "true offsets explained (R²)", "", ".2f", HIGHER,
         short="offset R2"),
-    _signed_unit("diagnostics/heading", "cosine of displacement and true offset", HIGHER,
+    _signed_unit("diagnostics/offset_cosine", "cosine of displacement and true offset", HIGHER,
         "offset cosine"),
     _unit("diagnostics/auroc", "AUROC of the likelihood", short="AUROC", form=".2f"),
     # of a training
@@ -275,6 +275,7 @@ _RENAMED = {  # keys of files that earlier versions wrote, or their first levels
     "belief/coverage_50": "belief/distance_coverage_50",
     "belief/coverage_90": "belief/distance_coverage_90",
     "apparent_size": "scale_ratio",
+    "diagnostics/heading": "diagnostics/offset_cosine",
 }
 
 

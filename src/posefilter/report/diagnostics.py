@@ -46,7 +46,7 @@ DIAGNOSTICS = (
         "Credible sets miss the truth: estimates are wrong, or beliefs too narrow."),
     Diagnostic("diagnostics/pairwise_cosine", 0.8, "All particles move in one direction."),
     Diagnostic("diagnostics/offset_r2", 0.1, "Displacements say no more than their mean would."),
-    Diagnostic("diagnostics/heading", 0.2, "Particles do not head for the object."),
+    Diagnostic("diagnostics/offset_cosine", 0.2, "Particles do not head for the object."),
     Diagnostic("diagnostics/auroc", 0.7, "The likelihood hardly tells object from background."),
     Diagnostic("diagnostics/off_frame/last", 0.1, "Particles drift out of the image."),
     Diagnostic("diagnostics/near_edge/last", 0.4, "Particles gather at the image's edges."),

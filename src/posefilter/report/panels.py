@@ -31,7 +31,8 @@ SIGNS = {
         "diagnostics/near_corner/last", "diagnostics/line_share/last",
     ),
     "Displacements": (
-        "val/diagnostics/pairwise_cosine", "val/diagnostics/offset_r2", "val/diagnostics/heading",
+        "val/diagnostics/pairwise_cosine", "val/diagnostics/offset_r2",
+        "val/diagnostics/offset_cosine",
     ),
     "Likelihood": ("val/diagnostics/auroc",),
 }  # fmt: skip
