@@ -26,9 +26,9 @@ KEYS = (
     "particles_on_object", "diagnostics/on_object/first", "iou", "add/auc", "add/recall_01d",
     "add_s/auc", "diagnostics/distinct/last", "diagnostics/pairwise_cosine",
     "diagnostics/offset_cosine", "diagnostics/offset_r2", "diagnostics/off_frame/last",
-    "diagnostics/near_edge/last",
-    "diagnostics/near_corner/last", "diagnostics/line_share/first", "diagnostics/line_share/last",
-    "diagnostics/auroc", "credibility/log_density",
+    "diagnostics/near_edge/last", "diagnostics/near_corner/last",
+    "diagnostics/first_axis_share/first", "diagnostics/first_axis_share/last", "diagnostics/auroc",
+    "credibility/log_density",
 )  # fmt: skip
 NAMED = ("model", "variant", "experiment", "sweep", "seed", "checkpoint")  # have columns, or none
 # these change no result
@@ -37,6 +37,10 @@ SILENT_KEYS = ("data.root", "data.meshes", "data.workers", "data.generate.worker
 BY_VISIBILITY = {"shipped"}  # tables that have rows of ranges of visibility
 ORDER = {ablation.name: number for number, ablation in enumerate(ABLATIONS)}
 ROW = ("table", "method", "variant", "changed", "seed")  # what tells a row from others
+RENAMED = {  # columns, by their names before
+    "along a line %": "first-axis share %",
+    "along a line at start %": "first-axis share at start %",
+}
 Run = dict[str, Any]
 
 
@@ -85,6 +89,18 @@ def name_today(override: str) -> str:
     """Return an override by today's names, so that a run keeps the row of those before it."""
     now = rename(override, "train")
     return override if now is None or " " in now else now
+
+
+def read_rows(path: Path) -> list[dict[str, str]]:
+    """Return the rows of a table of runs by today's names of columns and settings."""
+    with path.open() as file:
+        rows = [
+            {RENAMED.get(name, name): cell for name, cell in row.items()}
+            for row in csv.DictReader(file)
+        ]
+    for row in rows:
+        row["changed"] = " ".join(map(name_today, row["changed"].split()))
+    return rows
 
 
 def describe(run: Run) -> tuple[str, str, str]:
@@ -162,8 +178,7 @@ def main() -> int:
         return 1
     rows = {}
     if options.out.is_file():
-        with options.out.open() as file:
-            rows = {tuple(row[name] for name in ROW): row for row in csv.DictReader(file)}
+        rows = {tuple(row[name] for name in ROW): row for row in read_rows(options.out)}
     for name, runs in tables.items():
         print(f"{name}: {len(runs)} runs")
         rows |= {tuple(row[key] for key in ROW): row for row in make_rows(name, runs)}

@@ -79,6 +79,28 @@ def test_a_run_replaces_its_own_row_and_no_other(
     assert rows[0]["AUROC"] == "", "a figure that a run has not"
 
 
+def test_rows_of_before_have_todays_names(collect: ModuleType, tmp_path: Path) -> None:
+    into = tmp_path / "runs.csv"
+    into.write_text(
+        "table,changed,along a line at start %,along a line %,seed\n"
+        "t,filter/resample@model.train_filter.resample=soft loss=belief_nll_pose,64.20,90.10,0\n"
+    )
+    (row,) = collect.read_rows(into)
+    assert row == {
+        "table": "t",
+        "changed": "filter/resample@model.train_rollout.resample=soft loss=belief_nll_pose",
+        "first-axis share at start %": "64.20",
+        "first-axis share %": "90.10",
+        "seed": "0",
+    }
+
+
+def test_the_committed_columns_have_todays_names(collect: ModuleType) -> None:
+    with (collect.HOME / "docs" / "results" / "runs.csv").open() as file:
+        columns = next(csv.reader(file))
+    assert columns == ["table", "method", "variant", "changed", *collect.COLUMNS, "device", "torch"]
+
+
 def test_a_folder_without_runs_is_refused(
     collect: ModuleType,
     tmp_path: Path,

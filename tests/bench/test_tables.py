@@ -125,9 +125,9 @@ def measure_change(row: dict[str, str], figure: str) -> float:
     [
         ("unit_untrained", "patch_pf", "10", "on object", -1, "{} at 10 pixels and"),
         ("unit_untrained", "patch_pf", "1", "on object", -1, "{} at 1 pixel (five seeds each)"),
-        ("unit_untrained", "patch_pf", "half_frame", "along a line", 1, "{} at half a frame"),
-        ("unit_untrained", "patch_pf", "10", "along a line", 1, "{} at 10 pixels and 22"),
-        ("unit_untrained", "patch_pf", "1", "along a line", 1, "{} at 1 (five seeds)"),
+        ("unit_untrained", "patch_pf", "half_frame", "first-axis share", 1, "{} at half a frame"),
+        ("unit_untrained", "patch_pf", "10", "first-axis share", 1, "{} at 10 pixels and 22"),
+        ("unit_untrained", "patch_pf", "1", "first-axis share", 1, "{} at 1 (five seeds)"),
         ("unit_full", "patch_pf", "1", "on object", -1, "by seed {} are lost"),
         (
             "unit_full",

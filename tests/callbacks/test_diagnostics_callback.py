@@ -87,9 +87,9 @@ def test_drift_is_seen_in_numbers_curves_and_files(tmp_path: Path) -> None:
 def test_particles_that_coincide_have_no_line_to_draw() -> None:
     shares = {name: [0.5, 0.5] for name in LISTS}
     numbers = dict.fromkeys(NUMBERS, 0.5)
-    violet = LISTS["line_share"]
+    violet = LISTS["first_axis_share"]
     for values, drawn in (([0.9, 0.9], True), ([0.9, float("nan")], False)):
-        picture = draw_diagnostics(shares | numbers | {"line_share": values}, "signs")
+        picture = draw_diagnostics(shares | numbers | {"first_axis_share": values}, "signs")
         assert bool((picture == violet).all(-1).any()) is drawn
 
 

@@ -10,7 +10,7 @@ from posefilter.metrics.diagnostics import (
     FilterDiagnostics,
     auroc,
     distinct,
-    line_share,
+    first_axis_share,
     near_edge,
     offset_cosine,
     pairwise_cosine,
@@ -68,34 +68,34 @@ def test_a_line_has_all_variance_along_it_and_a_round_cloud_half() -> None:
     g = torch.Generator().manual_seed(0)
     along = torch.randn(1, 50, 1, generator=g)
     line = torch.tensor([400.0, -90.0]) + along * torch.tensor([3.0, -7.0])
-    assert line_share(line).item() == pytest.approx(1.0, abs=1e-5)
+    assert first_axis_share(line).item() == pytest.approx(1.0, abs=1e-5)
     cloud = torch.randn(1, 20000, 2, generator=g)
-    assert line_share(cloud).item() == pytest.approx(0.5, abs=0.01)
+    assert first_axis_share(cloud).item() == pytest.approx(0.5, abs=0.01)
     # 9 of 10 parts of the variance along an axis, wherever that points and whatever the unit
     stretched = cloud * torch.tensor([3.0, 1.0])
     c, s = math.cos(0.7), math.sin(0.7)
     turned = stretched @ torch.tensor([[c, s], [-s, c]])
-    assert line_share(stretched).item() == pytest.approx(0.9, abs=0.01)
+    assert first_axis_share(stretched).item() == pytest.approx(0.9, abs=0.01)
     torch.testing.assert_close(
-        line_share(turned * 1e4 + 1e5), line_share(stretched), rtol=1e-3, atol=0
+        first_axis_share(turned * 1e4 + 1e5), first_axis_share(stretched), rtol=1e-3, atol=0
     )
     frame = torch.rand(1, 20000, 2, generator=g) * torch.tensor([320.0, 240.0])
-    assert line_share(frame).item() == pytest.approx(0.64, abs=0.01)
+    assert first_axis_share(frame).item() == pytest.approx(0.64, abs=0.01)
 
 
 def test_particles_in_one_place_are_on_no_line_and_hide_no_other_image() -> None:
     state = torch.stack(
         [torch.full((3, 2), 7.0), torch.tensor([[0.0, 0.0], [1.0, 1.0], [2.0, 2.0]])]
     )
-    assert line_share(state)[0].isnan()
+    assert first_axis_share(state)[0].isnan()
     diverged = torch.tensor([[[0.0, 0.0], [torch.inf, 1.0]], [[0.0, 0.0], [1.0, torch.nan]]])
-    assert line_share(diverged).isnan().all()
+    assert first_axis_share(diverged).isnan().all()
     mask = torch.ones(2, 1, 20, 20, dtype=torch.bool)
     signs = FilterDiagnostics()
     signs.update(
         make_trace(state, torch.zeros(2, 3)), Batch(mask, mask, mask, *[torch.zeros(1)] * 5)
     )
-    assert signs.compute()["line_share"] == [pytest.approx(1.0)]
+    assert signs.compute()["first_axis_share"] == [pytest.approx(1.0)]
     assert signs.compute()["on_object"] == [1.0]
 
 

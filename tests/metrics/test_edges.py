@@ -29,7 +29,7 @@ from posefilter.metrics.confidence import calibration_error, error_at_coverage, 
 from posefilter.metrics.diagnostics import (
     auroc,
     distinct,
-    line_share,
+    first_axis_share,
     near_edge,
     offset_cosine,
     pairwise_cosine,
@@ -93,8 +93,8 @@ def test_areas_and_shares_of_too_little_are_undefined() -> None:
     assert auroc(score, torch.tensor([False, True])) == 1
     same = torch.ones(4, 2)
     assert math.isnan(r2_score(torch.zeros(4, 2), same))
-    assert line_share(torch.tensor([[[0.0, 0.0], [0.01, 0.0]]])).item() == pytest.approx(1.0)
-    assert line_share(torch.tensor([[[0.0, 0.0], [1e-4, 0.0]]])).isnan().all()
+    assert first_axis_share(torch.tensor([[[0.0, 0.0], [0.01, 0.0]]])).item() == pytest.approx(1.0)
+    assert first_axis_share(torch.tensor([[[0.0, 0.0], [1e-4, 0.0]]])).isnan().all()
 
 
 def test_positions_count_as_one_within_a_tenth_of_a_pixel() -> None:

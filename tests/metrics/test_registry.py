@@ -46,6 +46,7 @@ def test_a_number_is_written_in_its_unit() -> None:
         ("diagnostics/off_frame/last", "diagnostics/off_frame"),
         ("val/diagnostics/offset_cosine", "diagnostics/offset_cosine"),
         ("val/diagnostics/heading", "diagnostics/offset_cosine"),
+        ("diagnostics/line_share/last", "diagnostics/first_axis_share"),
         ("filter/ess/step_03", "filter/ess"),
         ("val/belief/coverage_90", "belief/distance_coverage_90"),
         ("belief/coverage_50", "belief/distance_coverage_50"),
@@ -101,6 +102,9 @@ def test_numbers_below_an_earlier_name_are_read_by_it() -> None:
     assert read_number(old, "scale_ratio/images") is None
     assert rename_key("val/apparent_size/images") == "val/scale_ratio/images"
     assert read_number({"diagnostics": {"heading": 0.5}}, "diagnostics/offset_cosine") == 0.5
+    lines = {"diagnostics": {"line_share": [0.6, 0.9]}}
+    assert read_number(lines, "diagnostics/first_axis_share/last") == 0.9
+    assert rename_key("diagnostics/line_share/first") == "diagnostics/first_axis_share/first"
     assert rename_key("apparent_sizes/images") == "apparent_sizes/images"
 
 

@@ -91,7 +91,7 @@ def test_which_way_is_better(info: MetricInfo) -> None:
         r"auc|recall|/ar$|iou|on_object|mass|log_density|auroc|found|distinct|r2|offset_cosine"
         r"|^(?:best_)?score$|likelihood"
     )
-    neither = r"instances|effective|entropy|spread|rank|frames|line_share|steps?$|ess$|sigma"
+    neither = r"instances|effective|entropy|spread|rank|frames|first_axis_share|steps?$|ess$|sigma"
     if re.search(worse, info.key):
         assert info.direction == LOWER
     elif re.search(better, info.key):

@@ -98,6 +98,19 @@ def test_diagnostics_are_found(run: Path) -> None:
     assert "diagnostics/auroc" not in found
 
 
+def test_diagnostics_of_before_have_todays_names(run: Path) -> None:
+    path = run / "metrics.json"
+    metrics = json.loads(path.read_text())
+    metrics["diagnostics"] |= {"heading": 0.1, "line_share": [0.6, 0.9]}
+    metrics["apparent_size"] = {"images": 5, "ratio": 1.25, "contradicting": 4}
+    path.write_text(json.dumps(metrics))
+    found = collect_numbers(read_run(run))
+    assert found["diagnostics/offset_cosine"] == 0.1
+    assert found["diagnostics/first_axis_share/last"] == 0.9
+    assert found["scale_ratio/ratio"] == 1.25
+    assert not [key for key in found if "heading" in key or "line" in key or "apparent" in key]
+
+
 def test_timings(run: Path) -> None:
     """Two steps a second, as the events' times have it."""
     told = dict(collect_timings(read_run(run)))

@@ -25,7 +25,7 @@ LISTS: dict[str, Color] = {
     "off_frame": AXES[0],
     "near_edge": AXES[2],
     "near_corner": (240, 160, 30),
-    "line_share": (150, 90, 200),
+    "first_axis_share": (150, 90, 200),
 }
 NUMBERS = ("pairwise_cosine", "offset_r2", "offset_cosine", "auroc")
 
@@ -116,8 +116,8 @@ def draw_diagnostics(found: dict[str, Any], title: str) -> np.ndarray:
 
     Returns:
         A figure (H, 600, 3) uint8: shares of particles on the object, off the frame, at an edge and
-        in a corner, and of their variance along a line; below it the numbers that are one for all
-        steps.
+        in a corner, and of their variance along its first principal axis; below it the numbers that
+        are one for all steps.
     """
     numbers = [(find_metric(f"diagnostics/{name}"), found[name]) for name in NUMBERS]
     foot = ", ".join(f"{info.short} {info.describe(value)}" for info, value in numbers)

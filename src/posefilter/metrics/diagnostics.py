@@ -86,7 +86,7 @@ def distinct(state: Tensor, cell_px: float = 0.1) -> Tensor:
     return torch.stack([cells.new_tensor(len(one.unique(dim=0)) / len(one)) for one in cells])
 
 
-def line_share(state: Tensor) -> Tensor:
+def first_axis_share(state: Tensor) -> Tensor:
     """Return the share of the particles' variance that lies along their first principal axis.
 
     1: all on one line, whatever its direction; 0.5: no direction is preferred. Particles that are
@@ -106,7 +106,7 @@ class FilterDiagnostics(Metric):
     """The diagnostics of this module over many traces: numbers, and lists with one number for each
     step.
 
-    Lists: off_frame, near_edge, near_corner, on_object, distinct, line_share. Numbers:
+    Lists: off_frame, near_edge, near_corner, on_object, distinct, first_axis_share. Numbers:
     pairwise_cosine, the mean over images and steps; offset_r2 and offset_cosine, of displacements
     against the true offset to the mask's nearest pixel; auroc of the likelihood, with particles on
     the mask as positives and others in the frame as negatives. The last three are over all steps.
@@ -138,7 +138,7 @@ class FilterDiagnostics(Metric):
             on = on_object(batch.mask, particles.state)
             off = is_off_frame(particles.state, width, height).float().mean(1)
             steps.append(torch.stack([on, off, edge, corner, distinct(particles.state)]))
-            lines.append(line_share(particles.state))
+            lines.append(first_axis_share(particles.state))
             self.cosine.append(pairwise_cosine(output.displacement))
             state = particles.state[:, : self.max_particles]
             displacement = output.displacement[:, : self.max_particles]
@@ -162,7 +162,7 @@ class FilterDiagnostics(Metric):
         lists = zip(names, shares.T.tolist(), strict=True)
         displacement, true = offsets[:, :2], offsets[:, 2:]
         return dict(lists) | {
-            "line_share": concat_state(self.lines).nanmean(0).tolist(),
+            "first_axis_share": concat_state(self.lines).nanmean(0).tolist(),
             "pairwise_cosine": float(concat_state(self.cosine).nanmean()),
             "offset_r2": float(r2_score(displacement, true)),
             "offset_cosine": float(offset_cosine(displacement, true)),

@@ -230,10 +230,11 @@ _METRICS = (
     _share("diagnostics/near_edge", "at an edge", LOWER),
     _share("diagnostics/near_corner", "in a corner", LOWER),
     _share("diagnostics/distinct", "distinct particles", HIGHER, "distinct"),
-    _share("diagnostics/line_share", "variance along a line", short="along a line",
+    _share("diagnostics/first_axis_share", "variance along the first axis",
+        short="first-axis share",
         meaning="share of the particles' variance along its first principal axis; 50: round"),
-    _share("diagnostics/line_share/first", "variance along a line at the start",
-        short="along a line at start"),
+    _share("diagnostics/first_axis_share/first", "variance along the first axis at the start",
+        short="first-axis share at start"),
     _signed_unit("diagnostics/pairwise_cosine", "pairwise cosine of the displacements", LOWER,
         "pairwise cosine"),
     # at most 1, and without a least
@@ -276,6 +277,7 @@ _RENAMED = {  # keys of files that earlier versions wrote, or their first levels
     "belief/coverage_90": "belief/distance_coverage_90",
     "apparent_size": "scale_ratio",
     "diagnostics/heading": "diagnostics/offset_cosine",
+    "diagnostics/line_share": "diagnostics/first_axis_share",
 }
 
 

@@ -74,7 +74,7 @@ def collect_numbers(run: Run) -> dict[str, float]:
     """
     out = list_numbers(run.metrics) if run.metrics else read_last_validation(run.curves)[1]
     for name in run.metrics.get("diagnostics") or {}:
-        last = f"diagnostics/{name}/last"
+        last = rename_key(f"diagnostics/{name}/last")
         if (value := read_number(run.metrics, last)) is not None:
             out[last] = value
     if out.get("instances"):

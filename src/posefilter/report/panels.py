@@ -28,7 +28,7 @@ BELIEF = {
 SIGNS = {
     "Where particles end": (
         "diagnostics/on_object/last", "diagnostics/off_frame/last", "diagnostics/near_edge/last",
-        "diagnostics/near_corner/last", "diagnostics/line_share/last",
+        "diagnostics/near_corner/last", "diagnostics/first_axis_share/last",
     ),
     "Displacements": (
         "val/diagnostics/pairwise_cosine", "val/diagnostics/offset_r2",
