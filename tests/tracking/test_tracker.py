@@ -19,6 +19,7 @@ from posefilter.confidence.calibration import (
 )
 from posefilter.confidence.conformal import Conformal
 from posefilter.confidence.fit import Frames, fit_calibration
+from posefilter.confidence.scale_ratio import ScaleRatio
 from posefilter.confidence.tolerance import RIGHT, PoseErrors, PoseTolerance
 from posefilter.errors import UserError
 from posefilter.estimator import Estimator

@@ -6,7 +6,6 @@ from typing import Any, ClassVar
 from torch import Generator, Tensor
 
 from posefilter.capabilities import Capabilities, read_declared
-from posefilter.confidence.scale_ratio import ScaleRatio, measure_scale_ratio
 from posefilter.confidence.features import measure_coordinates
 from posefilter.confidence.scale_ratio import ScaleRatio, measure_scale_ratio
 from posefilter.errors import UserError

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from posefilter.confidence.calibration import Assessment
 from posefilter.confidence.features import measure_hidden
+from posefilter.confidence.scale_ratio import ScaleRatio
 from posefilter.confidence.tolerance import RIGHT, PoseTolerance
 from posefilter.confidence.verdicts import Costs, Verdict
 from posefilter.data.resize import network_size
