@@ -40,7 +40,7 @@ format: $(STAMP) ## put the code into its format
 	$(VENV)/bin/ruff format .
 	$(VENV)/bin/ruff check --fix .
 
-smoke: $(STAMP) ## run every method the whole way at toy size
+smoke: $(STAMP) ## run every method but parts_pf, which is for tools, the whole way at toy size
 	rm -rf outputs/smoke
 	for model in $(MODELS); do $(PY) train.py debug=smoke model=$$model console=json out=outputs/smoke/$$model || exit 1; done
 
