@@ -1,4 +1,4 @@
-"""Links and commands of the documents name files and headings that there are."""
+"""Links and commands of the documents name what there is, and their tables are tables."""
 
 import re
 from pathlib import Path
@@ -42,3 +42,13 @@ def test_every_command_names_what_there_is(page: Path) -> None:
     named += re.findall(r"\bpython (\w+\.py)\b", text)
     for path in named:
         assert (HOME / path).exists(), f"{path}: no such file"
+
+
+@pytest.mark.parametrize("page", _PAGES, ids=lambda page: str(page.relative_to(HOME)))
+def test_tables_and_lists_are_shown_as_such(page: Path) -> None:
+    """A table has a row of dashes below its head, and a list goes on after an empty line."""
+    text = re.sub(r"```.*?```", "", page.read_text(encoding="utf-8"), flags=re.DOTALL)
+    for head, below in re.findall(r"^(?<!\|\n)(\|.*)\n(.*)", text, re.M):
+        assert re.fullmatch(r"\|[ :|-]+\|", below), f"{head}: no row of dashes below"
+    for item in re.findall(r"^ {4}.*\n(- .*)", text, re.M):
+        raise AssertionError(f"{item}: no empty line above")
