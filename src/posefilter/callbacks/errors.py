@@ -47,11 +47,8 @@ class ErrorTable(TraceCallback):
         rows = measure_batch(method, trace, batch, [records[i] for i in batch.frame_id.tolist()])
         self.rows += rows
         for i, row in enumerate(rows):
-            error = (
-                row.error_mm / 1000
-                if math.isfinite(row.diameter_mm)
-                else 1 - row.particles_on_object
-            )
+            posed = math.isfinite(row.diameter_mm)
+            error = row.error_mm / 1000 if posed else 1 - row.particles_on_object
             keep = partial(keep_image, trace, batch, method, i, error, row.image)
             self._selection.offer(error, keep)
 

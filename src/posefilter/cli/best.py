@@ -191,15 +191,10 @@ def check_kept(callbacks: Sequence[Callback], folder: Path) -> None:
 
 def _check_mode(setting: str, callback: Best | EarlyStopping, what: str) -> None:
     """Raise UserError where a callback takes the worse of a number for the better."""
-    better = _find_mode(str(callback.monitor))
-    if better not in (None, callback.mode):
-        raise UserError(f"{setting}: {what} {callback.monitor}; must be {better}")
-
-
-def _find_mode(monitor: str) -> str | None:
-    """Return which way a number of the validation is better, "max" or "min"; None: not known."""
     try:
-        direction = find_metric(monitor).direction
-    except UserError:
-        return None
-    return {HIGHER: "max", LOWER: "min"}.get(direction)
+        direction = find_metric(str(callback.monitor)).direction
+    except UserError:  # a number of one's own
+        return
+    better = {HIGHER: "max", LOWER: "min"}.get(direction, callback.mode)
+    if better != callback.mode:
+        raise UserError(f"{setting}: {what} {callback.monitor}; must be {better}")

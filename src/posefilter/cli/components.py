@@ -2,10 +2,11 @@
 
 from typing import Any
 
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 
 from posefilter.cli.instantiate import hint
 from posefilter.cli.job import Job
+from posefilter.cli.plain import unresolved
 from posefilter.errors import UserError
 
 SECTIONS = ("filter", "model")
@@ -24,9 +25,7 @@ def loosen(arguments: list[str], name: str) -> list[str]:
 
 def changes(cfg: DictConfig) -> dict[str, Any]:
     """Return what a test-time configuration says of the method."""
-    return {
-        name: OmegaConf.to_container(cfg[name], resolve=False) for name in SECTIONS if cfg.get(name)
-    }
+    return {name: unresolved(cfg[name]) for name in SECTIONS if cfg.get(name)}
 
 
 def chosen(job: Job) -> dict[str, str]:

@@ -38,11 +38,9 @@ def list_learned(record: Path, data: PoseDataModule, part: str = "test") -> list
         part: `test`, or `val` for what is calibrated on.
     """
     before = read_json(record) if record.is_file() else None
-    if not isinstance(before, dict) or Path(str(before.get("root"))).resolve() != (
-        data.root.resolve()
-    ):
-        return []
-    split = before.get("split")
+    before = before if isinstance(before, dict) else {}
+    same = Path(str(before.get("root"))).resolve() == data.root.resolve()
+    split = before.get("split") if same else None
     if not isinstance(split, dict) or not all(isinstance(part, dict) for part in split.values()):
         return []
     return find_learned(split, data.split_record(), part)

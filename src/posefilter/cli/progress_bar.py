@@ -158,7 +158,9 @@ class Bars(Callback):
 
     def on_validation_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Put a line in its place."""
-        self._looked()
+        if self._looking is not None:
+            self._shown().remove_task(self._looking)
+            self._looking = None
         if not trainer.sanity_checking:
             said = f"step {trainer.global_step}: {format_metrics(trainer.callback_metrics)}"
             self._shown().console.print(said, highlight=False)
@@ -173,11 +175,6 @@ class Bars(Callback):
     def _advance(self, *_: Any, **__: Any) -> None:
         if self._looking is not None:
             self._shown().advance(self._looking)
-
-    def _looked(self) -> None:
-        if self._looking is not None:
-            self._shown().remove_task(self._looking)
-            self._looking = None
 
     def _shown(self) -> Progress:
         if self._bars is None:

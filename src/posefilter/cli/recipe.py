@@ -135,7 +135,7 @@ def check_data(data: Mapping[str, Any], typed: Mapping[str, Any]) -> None:
             continue
         place = key in ("root", "cache_dir") or key.endswith("out")
         if not stays_inside(value, Path()) or (
-            place and not (_below_outputs(value) or Path(value).is_dir())
+            place and not (Path("outputs") in Path(value).parents or Path(value).is_dir())
         ):
             raise UserError(
                 f"data.{key}={value}: a checkpoint decides on no such place; if it is right, type "
@@ -146,11 +146,6 @@ def check_data(data: Mapping[str, Any], typed: Mapping[str, Any]) -> None:
             "data.cache=disk: a checkpoint does not decide where frames are kept; type "
             "data.cache=disk or memory"
         )
-
-
-def _below_outputs(value: str) -> bool:
-    parts = Path(value).parts
-    return len(parts) > 1 and parts[0] == "outputs"
 
 
 def _check_value(path: str, value: Any) -> None:

@@ -55,11 +55,8 @@ def report(job: Job) -> None:
         there = (winner / "metrics.json").is_file()
         best = with_todays_names(read_run(winner)) if there else None
         page = make_sweep_page(found, best, compared(best) if best else None, command)
-    out = (
-        Path(str(job.cfg.out))
-        if job.cfg.out
-        else folder / ("comparison" if kind == "runs" else "report")
-    )
+    own = folder / ("comparison" if kind == "runs" else "report")
+    out = Path(str(job.cfg.out or own))
     charts = write_page(page, out)
     if not job.cfg.out:  # the folder is this command's own: what an earlier page had goes
         for earlier in {*out.glob("*.png")} - {out / name for name in charts}:

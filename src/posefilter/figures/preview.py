@@ -3,6 +3,7 @@ depth below it.
 """
 
 from collections.abc import Sequence
+from contextlib import suppress
 
 import cv2
 import numpy as np
@@ -63,10 +64,8 @@ def _read_instances(reader: BaseReader, image: Sequence[int]) -> list[Sample]:
     """Return those of an image's instances that can be read."""
     found = []
     for index in image:
-        try:
+        with suppress(BadData):
             found.append(reader.read(index))
-        except BadData:
-            continue
     return found
 
 
