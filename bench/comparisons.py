@@ -26,8 +26,7 @@ from marked import format_row, put_table, read_rows, split_row
 from programs import HOME, make_parser, run_command
 
 from posefilter.metrics.image_errors import FILE, ImageError, read_errors
-from posefilter.metrics.scores import recall
-from posefilter.report.image_errors import measure_auc
+from posefilter.metrics.scores import auc, recall
 
 ROOT, TINY_ROOT = Path("outputs/comparisons"), Path("outputs/comparisons_tiny")
 PAGE = HOME / "docs" / "results" / "comparisons.md"
@@ -223,6 +222,11 @@ def read_tests(root: Path) -> dict[str, list[Tested]]:
         model, count, seed = file.parent.name.rsplit("_", 2)
         tests["clutter"].append(Tested(model, int(count), int(seed), read_errors(file)))
     return tests
+
+
+def measure_auc(rows: Sequence[ImageError]) -> float:
+    """Return the ADD AUC of some images."""
+    return auc(torch.tensor([row.add_mm for row in rows], dtype=torch.float64) / 1000)
 
 
 def measure_recall(rows: Sequence[ImageError]) -> float:

@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 from batches import list_counts
-from comparisons import bootstrap, list_choices, measure_recall
+from comparisons import bootstrap, list_choices, measure_auc, measure_recall
 from marked import format_row, put_table
 from programs import HOME, make_parser
 from torch.utils.data import default_collate
@@ -31,7 +31,6 @@ from posefilter.metrics.image_errors import FILE, read_errors
 from posefilter.models.image_space import ImageSpace
 from posefilter.nets.encoders import FoveatedEncoder, NoEncoder
 from posefilter.report.gather import read_json
-from posefilter.report.image_errors import measure_auc
 from posefilter.types import Batch
 
 PAGE = HOME / "docs" / "results" / "sparse.md"

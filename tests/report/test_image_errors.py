@@ -10,9 +10,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
 from posefilter.errors import UserError
 from posefilter.metrics.image_errors import FILE, ImageError, write_errors
+from posefilter.metrics.scores import auc
 from posefilter.report.blocks import Paragraph, Section, Table, Text
 from posefilter.report.comparison_page import (
     judge,
@@ -29,7 +31,6 @@ from posefilter.report.image_errors import (
     compute_cdf,
     group_by_visibility,
     list_worst,
-    measure_auc,
 )
 from posefilter.report.page import Page
 from posefilter.report.run_page import make_run_page
@@ -68,7 +69,8 @@ def test_the_area_under_the_cdf_is_about_the_auc() -> None:
     """The published AUC is a sum of steps of the right end: with many images it is the area."""
     rows = make_rows(1, 2000)
     x, y = compute_cdf([row.add_mm for row in rows])
-    assert np.trapezoid(y, x) / 100 == pytest.approx(measure_auc(rows), abs=0.1)
+    published = auc(torch.tensor([row.add_mm for row in rows], dtype=torch.float64) / 1000)
+    assert np.trapezoid(y, x) / 100 == pytest.approx(published, abs=0.1)
 
 
 def test_ranges_of_visibility_hold_each_image_once_and_in_order() -> None:

@@ -221,18 +221,18 @@ def mark_result(result: Result, shape: Shape) -> Drawn:
 def print_result(result: Result) -> None:
     """Print whether and where the object is, and what speaks against it."""
     place = np.array2string(1000 * result.pose[:3, 3], precision=1, suppress_small=True)
+    absent = result.verdict == "absent"
     if result.verdict is None:
         print(f"{result.object} at {place} mm, {result.seconds:.2f} s")
         print(f"no probability: {result.calibration_note}")
     else:
-        at = "" if result.verdict == "absent" else f", at {place} mm"
+        at = "" if absent else f", at {place} mm"
         print(f"{result.describe()}{at}, {result.seconds:.2f} s")
     if is_found_by_surface(result):
         within = describe_probability(result.probability_within(_SURFACE))
         said = f"probability {within} {_SURFACE.describe()}"
         how = f"pose_tolerance.add_s={_SURFACE.add_s}"
         print(f"{said}: its place is surer than its rotation ({how})")
-    absent = result.verdict == "absent"
     if not absent:
         said = "if it is right" if result.belief_calibrated else "the particles"
         print(f"{said}: {result.belief.uncertainty().describe()}")

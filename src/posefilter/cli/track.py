@@ -172,27 +172,17 @@ def read_frames(video: Video, tracker: Tracker, cfg: DictConfig) -> Iterator[Vid
     skip = "skip" in (cfg.on_error, OmegaConf.select(cfg, "data.on_error"))
     for index in range(len(video)):
         try:
-            frame = read_frame(video, index, tracker)
+            frame = video.read(index)
+            if frame is None:  # the dataset cannot show it
+                continue
+            with naming(f"frame {frame.name}"):
+                tracker.check(frame.rgb, frame.depth, frame.intrinsics)
         except UserError as error:
             if not skip:
                 raise UserError(f"{error}; on_error=skip leaves such frames out") from error
             warn(cfg.console, f"left out: {error}", skipped=str(error))
-            continue
-        if frame is not None:
+        else:
             yield frame
-
-
-def read_frame(video: Video, index: int, tracker: Tracker) -> VideoFrame | None:
-    """Return a frame; None where the dataset cannot show it.
-
-    Raises:
-        UserError: It cannot be read, or not be tracked in; the message names it.
-    """
-    frame = video.read(index)
-    if frame is not None:
-        with naming(f"frame {frame.name}"):
-            tracker.check(frame.rgb, frame.depth, frame.intrinsics)
-    return frame
 
 
 def draw_frame(

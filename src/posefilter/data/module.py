@@ -14,7 +14,7 @@ from torch.utils.data import DataLoader
 
 from posefilter.data.absent import annotates_one_class, deal_images, find_absent
 from posefilter.data.cache import CACHES, FrameCache, open_cache
-from posefilter.data.dataset import EpochShuffle, FrameDataset
+from posefilter.data.dataset import EpochShuffle, FrameDataset, ResumableLoader
 from posefilter.data.decoding import FrameDecoder
 from posefilter.data.frames import FrameRecord
 from posefilter.data.generated_scenes import ensure_scenes
@@ -268,10 +268,7 @@ class PoseDataModule(LightningDataModule):
         """
         dataset = self._dataset("val")
         if len(dataset) == 0:
-            raise UserError(
-                "data.split: no frames for val, by which the best checkpoint is chosen; give it a "
-                "share, such as 'data.split={train: 0.8, val: 0.1, test: 0.1}'"
-            )
+            raise _lack("val, by which the best checkpoint is chosen")
         return dataset
 
     @property
@@ -287,10 +284,7 @@ class PoseDataModule(LightningDataModule):
     def check_test(self) -> None:
         """Raise UserError where the split leaves no frames to test on; nothing is decoded."""
         if not self._parts["test"]:
-            raise UserError(
-                "data.split: no frames for test; give it a share, such as "
-                "'data.split={train: 0.8, val: 0.1, test: 0.1}'"
-            )
+            raise _lack("test")
 
     def absent_dataset(self, split: str, limit: int | None = None) -> FrameDataset:
         """Return images of a split in which the object is not, the first so many of a fixed
@@ -343,34 +337,23 @@ class PoseDataModule(LightningDataModule):
         place = (0, 1) if trainer is None else (trainer.global_rank, trainer.world_size)
         order = EpochShuffle(len(dataset), self._seed, dataset.set_epoch, *place)
         full = len(order) >= self._batch_size
-        loader = make_loader(
-            dataset,
-            self._batch_size,
-            self._workers,
-            for_gpu=self._goes_to_gpu,
-            sampler=order,
-            drop_last=full,
-        )
+        loader = self._make_loader(dataset, self._batch_size, sampler=order, drop_last=full)
         if trainer is not None:
             loader.batches = count_batches(len(loader), trainer.limit_train_batches)
         return loader
 
-    @property
-    def _goes_to_gpu(self) -> bool:
-        """Whether a trainer moves batches to a GPU by CUDA."""
-        return self.trainer is not None and self.trainer.strategy.root_device.type == "cuda"
-
-    def _make_loader_in_order(self, dataset: FrameDataset) -> DataLoader[Batch]:
-        size = self._batch_size_test
-        return make_loader(dataset, size, self._workers, for_gpu=self._goes_to_gpu)
+    def _make_loader(self, dataset: FrameDataset, size: int, **options: Any) -> ResumableLoader:
+        """Return a loader of batches of a size, which a trainer may move to a GPU by CUDA."""
+        for_gpu = self.trainer is not None and self.trainer.strategy.root_device.type == "cuda"
+        return make_loader(dataset, size, self._workers, for_gpu=for_gpu, **options)
 
     def val_dataloader(self) -> DataLoader[Batch]:
         """Return validation batches in order."""
-        return self._make_loader_in_order(self.val_dataset)
+        return self._make_loader(self.val_dataset, self._batch_size_test)
 
     def test_dataloader(self) -> DataLoader[Batch]:
         """Return test batches in order."""
-        return self._make_loader_in_order(self.test_dataset)
+        return self._make_loader(self.test_dataset, self._batch_size_test)
 
     def predict_dataloader(self) -> DataLoader[Batch]:
         """Return test batches in order."""
@@ -462,3 +445,9 @@ class PoseDataModule(LightningDataModule):
             )
         augment = self._augment if split == "train" else None
         return FrameDataset(chosen, self._decoder.cache, augment, self._seed)
+
+
+def _lack(part: str) -> UserError:
+    """Return the error of a split that leaves no frames to a part."""
+    example = "'data.split={train: 0.8, val: 0.1, test: 0.1}'"
+    return UserError(f"data.split: no frames for {part}; give it a share, such as {example}")

@@ -84,7 +84,8 @@ def split_records(
         raise UserError(f"data.split: fractions {fractions} must be positive and sum to 1 at most")
     owner: dict[Any, str]
     if len(scenes) >= len(fractions):
-        owner = _divide(scenes, fractions, seed)
+        order = np.random.default_rng([seed, 7]).permutation(len(scenes))
+        owner = _deal([scenes[i] for i in order], fractions, NAMES[::-1])
         left = [(i, owner.get(record.group)) for i, record in enumerate(records)]
     else:
         owner = _divide_images(records, set(scenes), fractions, root)
@@ -164,16 +165,12 @@ def _divide_images(
     return _deal(images, fractions, NAMES)
 
 
-def _divide(scenes: list[str], fractions: Mapping[str, float], seed: int) -> dict[str, str]:
-    """Return the split of each scene: every fraction gets one scene at least."""
-    order = [scenes[i] for i in np.random.default_rng([seed, 7]).permutation(len(scenes))]
-    return _deal(order, fractions, NAMES[::-1])
-
-
 def _deal(
     things: Sequence[_Thing], fractions: Mapping[str, float], names: Sequence[str]
 ) -> dict[_Thing, str]:
-    """Return the split of each thing: in their order, the first name's share first."""
+    """Return the split of each thing: in their order, the first name's share first; every fraction
+    gets one thing at least.
+    """
     counts, left = _counts(len(things), fractions), iter(things)
     return {thing: name for name in names for thing in islice(left, counts.get(name, 0))}
 

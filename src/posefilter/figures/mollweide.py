@@ -7,13 +7,12 @@ from functools import cache
 
 import numpy as np
 import torch
-from matplotlib import colormaps
 from PIL import Image, ImageDraw
 
 from posefilter.figures.canvas import INK, PAPER, Color, draw_lines, load_font
 from posefilter.figures.layout import DETAIL, WIDTH, draw_scale
+from posefilter.figures.panels import map_colors
 
-_TURN = colormaps["hsv"]
 _GRID: Color = (205, 209, 214)
 _INK: Color = (96, 102, 112)
 _WORDS = (  # longitude and latitude [degrees], and what is there
@@ -110,8 +109,7 @@ def label_map(picture: np.ndarray, taken: np.ndarray) -> np.ndarray:
 
 def color_by_turn(turn: np.ndarray) -> np.ndarray:
     """Return the colors of turns, which end as they began.  (P,) [rad] -> (P, 3) uint8."""
-    share = (np.asarray(turn) / math.pi + 1) / 2
-    return np.asarray(_TURN(share)[..., :3] * 255).round().astype(np.uint8)
+    return map_colors(np.asarray(turn), -math.pi, math.pi, "hsv")
 
 
 def draw_turn_scale() -> np.ndarray:

@@ -23,6 +23,7 @@ from posefilter.figures.canvas import (
     full_view,
     split_dashes,
 )
+from posefilter.geometry.rigid import move
 from posefilter.images import to_camera, to_picture, to_pose
 from posefilter.meshes.mesh import Mesh
 from posefilter.rendering.embree import EmbreeRenderer, render_depth
@@ -97,7 +98,7 @@ def view_poses(
     corners = np.array(list(product(*bounds.T)))
     found = []
     for pose in poses:
-        camera = corners @ pose[:3, :3].T + pose[:3, 3]
+        camera = move(corners, pose)
         if np.isfinite(camera).all() and (camera[:, 2] > _NEAR).all():
             pixels = project(camera, np.asarray(K, np.float64))
             found.append(np.clip(pixels, 0, [width - 1, height - 1]))
@@ -143,7 +144,7 @@ def draw_axes(
     low, high = get_bounds(shape)
     length = 0.3 * float(np.linalg.norm(high - low))
     ends = (low + high) / 2 + length * np.concatenate([np.zeros((1, 3)), np.eye(3)])
-    camera = ends @ pose[:3, :3].T + pose[:3, 3]
+    camera = move(ends, pose)
     if (camera[:, 2] < _NEAR).any():
         return
     pixels = project(camera, K)
@@ -166,7 +167,7 @@ def outline_object(
         if coarse > 1:  # straight edges are no stairs
             found = [cv2.approxPolyDP(line, 0.7, closed=True)[:, 0] for line in found]
         return [(line + 0.5) * coarse - 0.5 for line in found]
-    camera = _clip_to_front(get_vertices(shape) @ pose[:3, :3].T + pose[:3, 3])
+    camera = _clip_to_front(move(get_vertices(shape), pose))
     if len(camera) < 3:
         return []
     return [cv2.convexHull(project(camera, K).astype(np.float32))[:, 0]]

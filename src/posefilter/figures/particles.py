@@ -29,6 +29,7 @@ from posefilter.figures.layout import (
     tile_width,
 )
 from posefilter.figures.overlay import list_axes
+from posefilter.figures.panels import map_colors
 from posefilter.geometry.camera import project
 from posefilter.geometry.lookup import is_off_frame
 from posefilter.geometry.pose import origin_of
@@ -36,7 +37,6 @@ from posefilter.geometry.spaces import PoseSpace
 from posefilter.protocols import Space
 from posefilter.types import Particles, Trace
 
-_WEIGHT = colormaps["plasma"]
 _REACH = 10.0  # the colors span weights from 1 / _REACH to _REACH times the mean
 
 
@@ -47,7 +47,7 @@ def color_by_weight(weights: np.ndarray) -> np.ndarray:
     """
     ratio = np.maximum(weights * len(weights), 1e-12)
     level = np.clip((np.log(ratio) / math.log(_REACH) + 1) / 2, 0, 1)
-    return np.asarray(_WEIGHT(level)[:, :3] * 255).round().astype(np.uint8)
+    return map_colors(level, 0, 1, "plasma")
 
 
 def draw_particles(
@@ -228,5 +228,5 @@ def choose_by_weight(weights: torch.Tensor, count: int) -> torch.Tensor:
 
 def draw_weight_scale() -> np.ndarray:
     """Return a row that explains the colors."""
-    ramp = (_WEIGHT(np.linspace(0, 1, 256))[:, :3] * 255).astype(np.uint8)
+    ramp = (colormaps["plasma"](np.linspace(0, 1, 256))[:, :3] * 255).astype(np.uint8)
     return draw_scale("weight: mean / 10", ramp, "x 10")

@@ -18,19 +18,20 @@ from posefilter.figures.layout import DETAIL, draw_legend, draw_scale
 from posefilter.figures.overlay import trace_outline
 
 _TILE = 320  # [px]
+_SHOWN = 4  # frames
 _DEPTH = colormaps["viridis"]
 _UNKNOWN = (40, 40, 40)
 
 
-def draw_preview(reader: BaseReader, name: str, frames: int, count: int = 4) -> np.ndarray | None:
-    """Return `count` of a dataset's frames, spread evenly, each with its depth below it.
+def draw_preview(reader: BaseReader, name: str, frames: int) -> np.ndarray | None:
+    """Return four of a dataset's frames, spread evenly, each with its depth below it.
 
     A frame of two cameras is shown as one of them sees it. Frames that cannot be read are left out;
     None where that leaves none, or none shows the object.
     """
     records = reader.records()
     images = _list_images(records)
-    spread = np.linspace(0, len(images) - 1, min(count, len(images)))
+    spread = np.linspace(0, len(images) - 1, min(_SHOWN, len(images)))
     chosen = [images[i] for i in np.unique(spread.round().astype(int))]
     read = [(records[image[0]].name, _read_instances(reader, image)) for image in chosen]
     found = [(title, samples) for title, samples in read if samples]

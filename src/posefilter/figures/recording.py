@@ -13,7 +13,9 @@ from posefilter.errors import missing_package
 from posefilter.figures.canvas import AXES, ESTIMATE
 from posefilter.figures.particles import choose_by_weight, color_by_weight
 from posefilter.figures.view_data import Cloud, Hypothesis, Moment, ViewData
+from posefilter.geometry.rigid import move
 from posefilter.meshes.mesh import Mesh
+from posefilter.meshes.rotational_symmetries import measure_angle
 
 TIMELINE = "step"
 _FAINT = 70  # opacity of the modes that are not the estimate, of 255
@@ -195,12 +197,9 @@ def describe(shown: ViewData) -> str:
     ]
     modes = ((f"mode {i}", mode) for i, mode in enumerate(shown.others, start=1))
     for name, one in [("estimate", shown.estimate), *modes]:
-        center, best = (
-            p[:3, :3] @ shown.center + p[:3, 3] for p in (one.pose, shown.estimate.pose)
-        )
-        cosine = (np.trace(one.pose[:3, :3].T @ shown.estimate.pose[:3, :3]) - 1) / 2
+        center, best = (move(shown.center, pose) for pose in (one.pose, shown.estimate.pose))
         place = ", ".join(f"{1000 * x:.0f}" for x in center)
-        turn = np.rad2deg(np.arccos(np.clip(cosine, -1, 1)))
+        turn = np.rad2deg(measure_angle(one.pose[:3, :3].T @ shown.estimate.pose[:3, :3]))
         lines.append(
             f"| {name} | {one.weight:.1%} | {place} | "
             f"{1000 * np.linalg.norm(center - best):.1f} | {turn:.1f}° |"
@@ -222,8 +221,7 @@ def _layout(shown: ViewData) -> Any:
     rest on the right.
     """
     rrb: Any = importlib.import_module("rerun.blueprint")
-    pose = shown.estimate.pose
-    target = pose[:3, :3] @ shown.center + pose[:3, 3]
+    target = move(shown.center, shown.estimate.pose)
     aside = np.array([-0.3, -0.25, -0.6]) * np.linalg.norm(target)
     eye = rrb.EyeControls3D(position=target + aside, look_target=target, eye_up=[0, -1, 0])
     contents = ["+ /**", "- /photograph/**", "+ /photograph", "- /filter/**", "- /about"]

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from posefilter.geometry.camera import pixel_grid, project
 from posefilter.geometry.pose import transform
+from posefilter.geometry.rigid import rigid
 
 KEYPOINTS = 9
 _FEWEST = 4  # of a pose by EPnP
@@ -128,8 +129,7 @@ def solve_pnp(
             )
     except cv2.error:  # degenerate points
         return None
-    pose = np.eye(4)
-    pose[:3, :3], pose[:3, 3] = cv2.Rodrigues(turn)[0], shift[:, 0]
+    pose = rigid(cv2.Rodrigues(turn)[0], shift[:, 0])
     depth = points @ pose[2, :3] + pose[2, 3]
     sound = found and np.isfinite(pose).all() and depth.min() > 0 and depth.max() < _FARTHEST
     return pose if sound else None

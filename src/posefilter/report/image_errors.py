@@ -7,13 +7,11 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
-import torch
 
 from posefilter.errors import UserError
 from posefilter.figures.layout import format_length
 from posefilter.metrics.image_errors import FILE, ImageError, read_errors, summarize_images
 from posefilter.metrics.registry import PERCENT, find_metric
-from posefilter.metrics.scores import auc
 from posefilter.report.blocks import Block, Cell, Fold, Heading, Paragraph, Table, Text, draw_charts
 from posefilter.report.charts import Line, Panel
 
@@ -108,11 +106,6 @@ def has_symmetries(rows: Sequence[ImageError]) -> bool:
     """
     known = not any(math.isnan(row.add_up_to_symmetry_mm) for row in rows)
     return known and any(row.add_up_to_symmetry_mm < row.add_mm - EQUAL_MM for row in rows)
-
-
-def measure_auc(rows: Sequence[ImageError]) -> float:
-    """Return the ADD AUC of some images."""
-    return auc(torch.tensor([row.add_mm for row in rows], dtype=torch.float64) / 1000)
 
 
 def show_errors(rows: Sequence[ImageError]) -> list[Block]:
