@@ -107,7 +107,7 @@ def calibrate(job: Job) -> None:
             f"and {FEWEST} are needed"
         )
     if cfg.sets_only:
-        calibration = learn_sets(method, [data.val_dataset], cfg.console)
+        calibration = learn_sets(method, data.val_dataset, cfg.console)
         save_whole({**checkpoint, "calibration": calibration.to_plain()}, out)
         title = f"{name}: conformal sets"
         show_table(cfg.console, title, list_groups(calibration))
@@ -125,7 +125,7 @@ def calibrate(job: Job) -> None:
             f"and {FEWEST} are needed; render some, and name their folder: absent=DIR ("
             f"{typed('generate', out='DIR', object=name, absent_fraction=1, frames=60)} meshes=...)"
         )
-    calibration = learn(method, [data.val_dataset], absent, data.source, cfg.console)
+    calibration = learn(method, data.val_dataset, absent, data.source, cfg.console)
     save_whole({**checkpoint, "calibration": calibration.to_plain()}, out)
     tell(job, method, calibration, out)
 
@@ -161,7 +161,7 @@ class FirstAnswers(NamedTuple):
 
 def collect_frames(
     method: PoseEstimator,
-    present: Sequence[FrameDataset],
+    present: FrameDataset,
     absent: Sequence[FrameDataset],
     console: str,
     first_answers: Sequence[FirstAnswers] = (),
@@ -178,13 +178,11 @@ def collect_frames(
             again: estimates, and the draws of other searches, stay what they would be.
     """
     values, there, errors, visibility, beliefs, answers = [], [], [], [], [], []
-    parts = [(one, True) for one in present] + [(one, False) for one in absent]
-    loaders = [
-        (make_loader(one, one.find_batch_size(_BATCH), 0), is_there) for one, is_there in parts
-    ]
-    count = sum(len(loader) for loader, _ in loaders)
+    parts = (present, *absent)
+    loaders = [make_loader(one, one.find_batch_size(_BATCH), 0) for one in parts]
+    count = sum(map(len, loaders))
     # batch after batch: all of a thousand frames would take gigabytes
-    batches = ((batch, is_there) for loader, is_there in loaders for batch in loader)
+    batches = ((batch, loader is loaders[0]) for loader in loaders for batch in loader)
     for number, (batch, is_there) in enumerate(_report_progress(batches, count, console)):
         truth = batch.camera_from_object
         seen = Batch(*(x.to(method.device) for x in hide_annotation(batch)))
@@ -230,7 +228,7 @@ def _report_progress(items: Iterable[_Item], count: int, console: str) -> Iterat
 
 def learn(
     method: PoseEstimator,
-    present: Sequence[FrameDataset],
+    present: FrameDataset,
     absent: Sequence[FrameDataset],
     source: str,
     console: str,
@@ -256,7 +254,7 @@ def learn(
     return fit_answers(frames, beliefs, first, method.object_model, source)
 
 
-def learn_sets(method: PoseEstimator, present: Sequence[FrameDataset], console: str) -> Calibration:
+def learn_sets(method: PoseEstimator, present: FrameDataset, console: str) -> Calibration:
     """Return the calibration of a method with other conformal sets, learned from frames that it has
     not seen: their probabilities, and the widths of their beliefs, are then those that new frames
     get, as split conformal prediction supposes.

@@ -1,14 +1,18 @@
 """Tables of the names that settings, choices, classes and their arguments had before today's.
 
-Each line of a table is a place and the names in it, `place: old > new, old > new`; what is indented
-goes on with it.  `renamed.py` reads them.
+Each line of a table is a place, or several, and the names in it, `place, place: old > new, old >
+new`; what is indented goes on with it.  `renamed.py` reads them.
 """
 
 
 def _read(table: str) -> dict[str, dict[str, str]]:
     """Return a table's places, with today's names by those of before."""
     lines = [line.split(": ", 1) for line in table.strip().replace("\n    ", " ").splitlines()]
-    return {place: dict(pair.split(" > ") for pair in names.split(", ")) for place, names in lines}
+    return {
+        place: dict(pair.split(" > ") for pair in names.split(", "))
+        for places, names in lines
+        for place in places.split(", ")
+    }
 
 
 def _join(places: dict[str, dict[str, str]]) -> dict[str, str]:
@@ -20,6 +24,9 @@ def _join(places: dict[str, dict[str, str]]) -> dict[str, str]:
     }
 
 
+_RENDERED = """occlusion > max_occlusion, occluded_share > occluded_fraction,
+    tabletop_share > tabletop_fraction, absent_share > absent_fraction,
+    covered_frames > fully_occluded_frames"""  # of rendering, wherever it is set
 # groups whose choices, and settings, are found elsewhere: by today's name, those of before
 _GROUPS = """
 filter/initialize: initialise initialize
@@ -63,14 +70,12 @@ KEYS = {
     "most_mb": "max_mb",
     "compact": "quantize",
     **_join(
-        _read("""
+        _read(f"""
 model: place_gradient > detach_position, relevance > objectness_weight, train_filter > train_rollout
 callbacks.figures: every > every_n_validations, without > exclude
 model.candidate_sampler: turns > rotations, levels > sigma_levels
 data: points > num_model_points, model_points > model_points_dir
-data.generate: occlusion > max_occlusion, occluded_share > occluded_fraction,
-    tabletop_share > tabletop_fraction, absent_share > absent_fraction,
-    covered_frames > fully_occluded_frames
+data.generate: {_RENDERED}
 filter: looks > max_searches, first_particles > initial_particles,
     zoom_diameter > magnified_width
 model.train_rollout: first_particles > initial_particles, zoom_diameter > magnified_width
@@ -82,21 +87,17 @@ tracker: walk > noise_scale, move_scale > noise_scale, kld_cell > kld_bin_size,
     look.start > probe.initial_sigma, look.stop > probe.final_sigma, look.points > probe.pixels
 tracker.motion: shift_mm > translation_mm, turn_deg > rotation_deg, momentum > velocity_gain,
     widest > max_noise_scale
-tracker.follow: least > min_particles, most > max_particles, start > initial_sigma,
-    stop > final_sigma, points > pixels
-tracker.search: least > min_particles, most > max_particles, start > initial_sigma,
+tracker.follow, tracker.search: least > min_particles, most > max_particles, start > initial_sigma,
     stop > final_sigma, points > pixels
 """)
     ),
 }
 # settings of single commands
-COMMANDS = _read("""
+COMMANDS = _read(f"""
 calibrate: replace > overwrite
 check_data: limit > max_frames
 convert_bag: keep > copy_messages, tolerance > max_time_difference
-generate: occlusion > max_occlusion, occluded_share > occluded_fraction,
-    tabletop_share > tabletop_fraction, absent_share > absent_fraction,
-    covered_frames > fully_occluded_frames
+generate: {_RENDERED}
 onboard: settings > train_overrides, clutter > distractor_meshes, clutter_scale > distractor_scale
 predict: view > save_rerun
 track: video > save_video, view > save_rerun
@@ -132,8 +133,7 @@ data/augment: whole > strong_full_image, camera_whole > camera_full_image
 loss/schedule: three > three_stages, three_motion > three_stages_displacement,
     only_motion > displacement_only, only_likelihood > likelihood_only
 model.detach_position: flows > false, stopped > true, true > false, false > true
-lookalike_texture: other > different, own > same
-data.generate.lookalike_texture: other > different, own > same
+lookalike_texture, data.generate.lookalike_texture: other > different, own > same
 experiment: memorise > memorize
 console: plain > json
 callbacks: none > checkpoints
@@ -149,44 +149,36 @@ ablation: s4_lesson > s4_displacement_loss, s5_place > s5_position,
     m8_truncated > m8_short, m12_held > m12_gated, m13_rate > m13_scheduler
 """)
 # classes, by their place below posefilter
-CLASSES = {
-    "filters.guided.Guided": "filters.auxiliary.AuxiliaryResampling",
-    "filters.transport.Ensemble": "filters.transport.EnsembleTransform",
-    "filters.transport.OptimalTransport": "filters.transport.SampledTransport",
-    "filters.initialize.FromRelevance": "filters.initialize.FromObjectness",
-    "filters.propagate.AxisTurns": "filters.propagate.AxisRotations",
-    "filters.propagate.HalfTurns": "filters.propagate.HalfTurnRotations",
-    "filters.texture.TextureTurns": "filters.texture.TextureRotations",
-    "losses.belief_maps.BeliefMaps": "losses.heatmaps.Heatmaps",
-    "nets.belief_maps.BeliefMapNet": "nets.heatmaps.HeatmapNet",
-    "filters.propagate.Chain": "filters.propagate.Compose",
-    "filters.resample.BelowESS": "filters.resample.AdaptiveResampling",
-    "filters.refine.Chain": "filters.refine.Compose",
-    "filters.reweight.Annealed": "filters.reweight.CurrentLikelihood",
-    "filters.reweight.Sequential": "filters.reweight.SequentialBayes",
-    "filters.reweight.TemperedSMC": "filters.reweight.LikelihoodRatio",
-    "losses.contrast.Contrast": "losses.contrastive.Contrastive",
-    "nets.glimpse.SmoothGlimpse": "nets.glimpse.BilinearGlimpse",
-    "models.box_heads.SpreadBox": "models.box_heads.QuantileBox",
-    "models.schedules.warm_cosine": "models.lr_schedulers.warmup_cosine",
-    "models.schedules.warmup_cosine": "models.lr_schedulers.warmup_cosine",
-    "nets.context.NoContext": "nets.encoders.NoEncoder",
-    "nets.context.Pyramid": "nets.encoders.PyramidEncoder",
-    "nets.context.ConvEncoder": "nets.encoders.UNetEncoder",
-    "nets.context.ResNetContext": "nets.encoders.ResNetEncoder",
-    "data.augmentation.Window": "data.augmentation.RandomCrop",
-    "data.augmentation.Blank": "data.augmentation.RandomErasing",
-    "data.augmentation.Color": "data.augmentation.ColorJitter",
-}
+CLASSES = _join(
+    _read("""
+data.augmentation: Window > RandomCrop, Blank > RandomErasing, Color > ColorJitter
+filters: guided.Guided > auxiliary.AuxiliaryResampling
+filters.initialize: FromRelevance > FromObjectness
+filters.propagate: AxisTurns > AxisRotations, HalfTurns > HalfTurnRotations, Chain > Compose
+filters.refine: Chain > Compose
+filters.resample: BelowESS > AdaptiveResampling
+filters.reweight: Annealed > CurrentLikelihood, Sequential > SequentialBayes,
+    TemperedSMC > LikelihoodRatio
+filters.texture: TextureTurns > TextureRotations
+filters.transport: Ensemble > EnsembleTransform, OptimalTransport > SampledTransport
+losses: belief_maps.BeliefMaps > heatmaps.Heatmaps, contrast.Contrast > contrastive.Contrastive
+models: schedules.warm_cosine > lr_schedulers.warmup_cosine,
+    schedules.warmup_cosine > lr_schedulers.warmup_cosine
+models.box_heads: SpreadBox > QuantileBox
+nets: belief_maps.BeliefMapNet > heatmaps.HeatmapNet, context.NoContext > encoders.NoEncoder,
+    context.Pyramid > encoders.PyramidEncoder, context.ConvEncoder > encoders.UNetEncoder,
+    context.ResNetContext > encoders.ResNetEncoder
+nets.glimpse: SmoothGlimpse > BilinearGlimpse
+""")
+)
 # arguments of classes, by today's place of the class below posefilter
-ARGUMENTS = _read("""
+ARGUMENTS = _read(f"""
 filters.loop.ParticleFilter: looks > max_searches, first_particles > initial_particles,
     zoom_diameter > magnified_width
-filters.propagate.Compose: pieces > components
+filters.propagate.Compose, filters.refine.Compose: pieces > components
 filters.propagate.Gaussian: factor > noise_scale
 filters.propagate.HalfTurnRotations: share > probability
 filters.propagate.AxisRotations: share > probability, any_angle > uniform_angle_probability
-filters.refine.Compose: pieces > components
 filters.refine.Rescore: top > top_k
 filters.refine.MeanShift: rounds > iterations, pairs > antithetic_pairs, start > initial_scale,
     end > final_scale
@@ -203,10 +195,8 @@ models.candidate_samplers.CandidatePoses: each > candidates_per_kind, turns > ro
 models.candidate_samplers.LabeledRays: past > margin_behind, start > min_depth
 models.box_heads.QuantileBox: beyond > quantile
 models.base.PoseEstimator: train_filter > train_rollout
-models.cnn_patch.CnnPatch: relevance > objectness_weight, relevance_weight > objectness_weight
-models.downsized.Downsized: relevance > objectness_weight, relevance_weight > objectness_weight
-models.patch_pf.PatchPF: relevance > objectness_weight, relevance_weight > objectness_weight
-models.pixel_pf.PixelPF: relevance > objectness_weight, relevance_weight > objectness_weight
+models.cnn_patch.CnnPatch, models.downsized.Downsized, models.patch_pf.PatchPF,
+    models.pixel_pf.PixelPF: relevance > objectness_weight, relevance_weight > objectness_weight
 models.pose_pf.PosePF: even_points > quasi_monte_carlo
 models.rotation_grid.RotationGrid: reach > crop_radius
 models.loss_schedule.Stage: factors > loss_weights
@@ -217,20 +207,16 @@ nets.heads.Bounded: reach > max_displacement
 nets.mlp.LatentNet: displacement_reads > displacement_input
 labels.displacement.TowardsObject: reach > max_displacement
 nets.paper_likelihood.PaperLikelihood: about > anchor
-losses.displacement.Chamfer: most > max_pixels
-losses.rgbd_chamfer.RgbdChamfer: most > max_pixels
+losses.displacement.Chamfer, losses.rgbd_chamfer.RgbdChamfer: most > max_pixels
 losses.pose_loss.SurfacePointLoss: within > offset_weight
 labels.paper_points.PaperPoints: on > surface_label, behind > behind_label
 data.module.PoseDataModule: points > num_model_points, model_points > model_points_dir
-synthetic.generate.generate: occlusion > max_occlusion, occluded_share > occluded_fraction,
-    tabletop_share > tabletop_fraction, absent_share > absent_fraction,
-    covered_frames > fully_occluded_frames
+synthetic.generate.generate: {_RENDERED}
 data.augmentation.RollAndZoom: about > pivot, any_roll > uniform_roll_probability
 data.augmentation.RandomCrop: anywhere > uniform_probability
 data.augmentation.RandomErasing: most > max_rectangles
 callbacks.health.FilterHealth: most > max_iterations, share > max_time_fraction
-callbacks.diagnostics.Diagnostics: share > max_time_fraction
-callbacks.figures.Figures: share > max_time_fraction
+callbacks.diagnostics.Diagnostics, callbacks.figures.Figures: share > max_time_fraction
 """)
 # base classes, by the setting that holds one of them: one's own class there has their arguments too
 BASES = {
@@ -243,7 +229,5 @@ VALUES = {("synthetic.generate.generate", "lookalike_texture"): CHOICES["lookali
 # options of the data module, by the reader that takes them
 OPTIONS = _read("""
 bop: part > split
-fat: parts > subsets
-scenes: parts > subsets
-ycb_video: parts > subsets
+fat, scenes, ycb_video: parts > subsets
 """)

@@ -479,7 +479,7 @@ def calibrate(work: Onboarding) -> None:
     checkpoint = read_checkpoint(work.weights)
     method = method_of(checkpoint, lightning=False)
     method.to(choose_device())
-    calibration = learn(method, [data.val_dataset], [without], data.source, work.cfg.console)
+    calibration = learn(method, data.val_dataset, [without], data.source, work.cfg.console)
     save_whole({**checkpoint, "calibration": calibration.to_plain()}, work.weights)
     work.stages.keep(calibration={"counts": calibration.counts, "quality": calibration.quality})
 

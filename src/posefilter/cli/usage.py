@@ -186,5 +186,6 @@ def _entry(left: str, right: str, width: int) -> list[str]:
 
 def _wrap(text: str, width: int, indent: int) -> list[str]:
     """Return a text's lines, those after the first indented."""
-    whole = {"break_long_words": False, "break_on_hyphens": False}
-    return textwrap.wrap(text, width, subsequent_indent=" " * indent, **whole)
+    return textwrap.wrap(
+        text, width, subsequent_indent=" " * indent, break_long_words=False, break_on_hyphens=False
+    )

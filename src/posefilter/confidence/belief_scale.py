@@ -275,7 +275,7 @@ def _resample(poses: Tensor, weights: Tensor, count: int) -> Tensor:
     return poses[torch.searchsorted(ladder, steps).clamp_max(len(weights) - 1)]
 
 
-def draw_student_t(count: int, degrees: int = DEGREES, seed: int | None = None) -> Tensor:
+def draw_student_t(count: int, degrees: int = DEGREES) -> Tensor:
     """Return draws (count, 6) of Student's t about 0, in opposite pairs.
 
     Their second moment is exactly that of the distribution, n / (n - 2) along each axis.  Pairs
@@ -284,9 +284,8 @@ def draw_student_t(count: int, degrees: int = DEGREES, seed: int | None = None) 
     Args:
         count: 32 at least.
         degrees: Of freedom, n.
-        seed: Of the generator; None: a good one.
     """
-    generator = torch.Generator().manual_seed(_SEEDS[degrees] if seed is None else seed)
+    generator = torch.Generator().manual_seed(_SEEDS[degrees])
     half = torch.randn((count + 1) // 2, 6, generator=generator, dtype=torch.float64)
     squares = torch.randn((len(half), degrees), generator=generator, dtype=torch.float64).square()
     half = half * (degrees / squares.sum(1, keepdim=True)).sqrt()

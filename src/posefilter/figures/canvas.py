@@ -31,6 +31,7 @@ PAPER: Color = (255, 255, 255)
 _HALO: Color = (0, 0, 0)
 _BEYOND = (200, 200, 200)
 _SHIFT = 4  # OpenCV draws in sixteenths of a pixel
+_TAG = 14  # [px] letters of a tag
 _FARTHEST = 16_000  # [px] OpenCV's sixteenths overflow beyond
 
 
@@ -162,9 +163,7 @@ def split_dashes(path: np.ndarray, closed: bool, dash: int = 11, gap: int = 8) -
     return [np.stack([np.interp(one, length, points[:, i]) for i in (0, 1)], 1) for one in at]
 
 
-def draw_tag(
-    picture: np.ndarray, text: str, at: tuple[float, float], color: Color, size: int = 14
-) -> None:
+def draw_tag(picture: np.ndarray, text: str, at: tuple[float, float], color: Color) -> None:
     """Write a short text into a picture, in place, with a dark rim so that it shows on any ground.
 
     Args:
@@ -172,9 +171,8 @@ def draw_tag(
         text: What is written.
         at: Where its lower left corner goes (u, v) [px]; moved so that it stays in the picture.
         color: Of the letters.
-        size: Of the letters [px].
     """
-    letters = load_font(size, bold=True)
+    letters = load_font(_TAG, bold=True)
     left, top, right, bottom = letters.getbbox(text, anchor="ls", stroke_width=2)
     u = float(np.clip(at[0], -left, max(picture.shape[1] - right, -left)))
     v = float(np.clip(at[1], -top, max(picture.shape[0] - bottom, -top)))

@@ -45,13 +45,11 @@ def record(shown: ViewData, path: Path) -> None:
     for number, moment in enumerate(shown.moments):
         stream.set_time(TIMELINE, sequence=number)
         _log_particles(rr, stream, shown, moment)
-    _log_hypothesis(
-        rr, stream, "estimate", shown.estimate, shown, make_textured(rr, shown.mesh), ESTIMATE
-    )
+    mesh = make_textured(rr, shown.mesh)
+    _log_hypothesis(rr, stream, "estimate", shown.estimate, shown, mesh, ESTIMATE)
     for number, other in enumerate(shown.others, start=1):
-        _log_hypothesis(
-            rr, stream, f"modes/{number}", other, shown, make_faint(rr, shown.mesh), _OTHER
-        )
+        mesh = make_faint(rr, shown.mesh)
+        _log_hypothesis(rr, stream, f"modes/{number}", other, shown, mesh, _OTHER)
     stream.flush()
     stream.disconnect()
 

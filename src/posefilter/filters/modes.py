@@ -10,6 +10,7 @@ from posefilter.protocols import Space
 
 # of the diameter: nearer poses belong to one mode, as in the recall of ADD < 0.1 d
 APART = 0.1
+_CHUNK = 1 << 20  # distances that are computed at a time
 
 
 class Modes(NamedTuple):
@@ -71,14 +72,14 @@ def find_pose_modes(poses: Tensor, log_weights: Tensor, space: Space, diameter: 
     return find_modes(poses, log_weights, space, bandwidth=APART * diameter / 3, max_distance=3.0)
 
 
-def _find_leaders(state: Tensor, space: Space, max_distance: float, chunk: int = 1 << 20) -> Tensor:
+def _find_leaders(state: Tensor, space: Space, max_distance: float) -> Tensor:
     """Return the index of the particle that each one follows, itself if there is none.  -> (N,).
 
     Particles are sorted by falling density, so only earlier ones are candidates.
     """
     index = torch.arange(len(state), device=state.device)
     leaders = []
-    for block in index.split(max(1, chunk // len(state))):
+    for block in index.split(max(1, _CHUNK // len(state))):
         distance = space.distance(state[block][:, None], state[None])
         distance = distance.masked_fill(index[None] >= block[:, None], torch.inf)
         shortest, nearest = distance.min(1)

@@ -96,7 +96,8 @@ def _find_type_flaw(sample: Any, objects: int) -> str:
     """Return what has another type or shape than a `Sample` says, "" where nothing has."""
     if not isinstance(sample, Sample):
         return f"returned a {type(sample).__name__}, not a posefilter.data.frames.Sample"
-    height, width = getattr(sample.rgb, "shape", (0, 0))[:2] if _is_image(sample.rgb) else (0, 0)
+    size: Any = getattr(sample.rgb, "shape", ())
+    height, width = size[:2] if len(size) == 3 and size[2] == 3 else (0, 0)
     wanted = {
         "rgb": ("u1", (height, width, 3), "uint8 (H, W, 3), red first, 0 to 255"),
         "depth": ("f", (height, width), "floats (H, W) [m], as large as rgb, 0 where unknown"),
@@ -120,10 +121,6 @@ def _find_type_flaw(sample: Any, objects: int) -> str:
     if not isinstance(number, int | np.integer) or not 0 <= number < objects:
         return f"object_id is {number}; wanted is an index into the reader's {objects} `objects`"
     return ""
-
-
-def _is_image(value: Any) -> bool:
-    return isinstance(value, np.ndarray) and value.ndim == 3 and value.shape[2] == 3
 
 
 def _find_number_flaw(sample: Sample) -> tuple[str, str] | None:
