@@ -46,46 +46,55 @@ def convert_bag(job: Job) -> None:
         check_once(estimator.objects)
         find = choose_finder(estimator, cfg.track, cfg.seed)
         tally = Tally(dict.fromkeys(estimator.objects, 0))
-        watch = bars(shown=cfg.console != JSON, transient=True)
-        with BagWriter(out, str(cfg.detections)) as writer, watch as bar:
-            task = bar.add_task("images", total=reader.images)
-            copying = False
+        with BagWriter(out, str(cfg.detections)) as writer:
             if cfg.copy_messages:
                 writer.add_connections(reader.reader.connections)  # first: it may be refused
+            without = ", without the messages of the bag" if cfg.copy_messages else ""
+            kept = "the {} images before it are in {}" + without
             try:
-                for frame in reader.frames():
-                    stamp = stamp_of(frame)
-                    try:
-                        results = find(frame)
-                    except UserError as error:
-                        reader.leave_out(stamp, error)
-                        continue
-                    tally.add(frame, results, cfg.console)
-                    writer.write(make_detections(results, frame.header), frame.time)
-                    for sentence in reader.warnings[tally.warned :]:
-                        warn(cfg.console, sentence)
-                    tally.warned = len(reader.warnings)
-                    done = reader.unpaired + reader.early + len(reader.skipped)
-                    bar.update(task, completed=tally.images + done)
-                if not tally.images:
-                    raise UserError(f"bag={cfg.bag}: {reader.explain_none()}")
+                write_detections(reader, writer, find, tally, cfg)
                 if cfg.copy_messages:
-                    copying = True
+                    kept = "all {} images and a part of the bag's messages are in {}"
                     writer.copy(reader.messages())
             except (UserError, KeyboardInterrupt, Stopped) as error:
-                kept = f"the {writer.count} images before it are in {out}"
-                if copying:
-                    kept = (
-                        f"all {writer.count} images and a part of the bag's messages are in {out}"
-                    )
-                elif cfg.copy_messages:
-                    kept += ", without the messages of the bag"
+                kept = kept.format(writer.count, out)
                 if writer.count and isinstance(error, UserError):
                     raise UserError(f"{error}; {kept}") from error
                 if writer.count:
                     warn(cfg.console, f"stopped; {kept}", images=writer.count)
                 raise
     tell(tally, reader, cfg, out)
+
+
+def write_detections(
+    reader: BagReader,
+    writer: BagWriter,
+    find: Callable[[BagFrame], list[Result]],
+    tally: "Tally",
+    cfg: DictConfig,
+) -> None:
+    """Write what is found in each image, under a bar; say what is doubtful as it comes.
+
+    Raises:
+        UserError: Not one image could be used, or one cannot be read and is not skipped.
+    """
+    with bars(shown=cfg.console != JSON, transient=True) as bar:
+        task = bar.add_task("images", total=reader.images)
+        for frame in reader.frames():
+            try:
+                results = find(frame)
+            except UserError as error:
+                reader.leave_out(stamp_of(frame), error)
+                continue
+            tally.add(frame, results, cfg.console)
+            writer.write(make_detections(results, frame.header), frame.time)
+            for sentence in reader.warnings[tally.warned :]:
+                warn(cfg.console, sentence)
+            tally.warned = len(reader.warnings)
+            done = reader.unpaired + reader.early + len(reader.skipped)
+            bar.update(task, completed=tally.images + done)
+    if not tally.images:
+        raise UserError(f"bag={cfg.bag}: {reader.explain_none()}")
 
 
 @dataclass
