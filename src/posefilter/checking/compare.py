@@ -93,10 +93,10 @@ def likely_causes(views: Sequence[View], geometry: Geometry, before: float) -> l
         return [said, *_depth_scale(fits)]
     undone = [list_causes(view) for view in views]
     words = [one[0] for one in undone[0]]
-    tried = []
-    for number in range(len(words)):
-        own = [(view, *causes[number][1:]) for view, causes in zip(views, undone, strict=True)]
-        tried.append([compare(view, geometry, pose, K) for view, pose, K in own])
+    tried = [
+        [compare(view, geometry, pose, K) for view, (_, pose, K) in zip(views, causes, strict=True)]
+        for causes in zip(*undone, strict=True)
+    ]
     scores = [float(np.median([fit.iou for fit in each])) for each in tried]
     for number in range(len(_POWERS)):  # of the translations
         if np.median([(fit.rendered > 0).mean() for fit in tried[number]]) > _WHOLE:

@@ -36,8 +36,8 @@ _NEEDED = {
 }
 
 
-# mappings that the command line replaces whole, where Hydra would merge them with the defaults
-_WHOLE = ("data.split",)
+# a mapping that the command line replaces whole, where Hydra would merge it with the defaults
+_WHOLE = "data.split"
 
 
 @dataclass(frozen=True)
@@ -67,7 +67,7 @@ def make_job(
 
 
 def _replace_typed(cfg: DictConfig, overrides: Sequence[str]) -> None:
-    """Keep of each mapping in `_WHOLE` only what was typed, once it was typed whole.
+    """Keep of the mapping `_WHOLE` only what was typed, once it was typed whole.
 
     `data.split={test: 1.0}` means that and nothing else: the default shares of train and val are
     not added. `data.split.test=0.5` changes one share and leaves the others.
@@ -76,20 +76,20 @@ def _replace_typed(cfg: DictConfig, overrides: Sequence[str]) -> None:
         cfg: The composed configuration, changed in place.
         overrides: The command line's overrides.
     """
-    for key in _WHOLE:
-        own = [text for text in overrides if text.lstrip("+~").startswith((f"{key}=", f"{key}."))]
-        typed: set[str] | None = None
-        for override in OverridesParser.create().parse_overrides(own):
-            path, value = override.key_or_group, override.value()
-            if path == key and isinstance(value, dict):
-                typed = {str(name) for name in value}
-            elif typed is not None:
-                typed.add(path.removeprefix(f"{key}."))
-        node = OmegaConf.select(cfg, key, default=None)
-        if typed is not None and isinstance(node, DictConfig):
-            with open_dict(node):
-                for name in set(map(str, node)) - typed:
-                    del node[name]
+    starts = (f"{_WHOLE}=", f"{_WHOLE}.")
+    own = [text for text in overrides if text.lstrip("+~").startswith(starts)]
+    typed: set[str] | None = None
+    for override in OverridesParser.create().parse_overrides(own):
+        path, value = override.key_or_group, override.value()
+        if path == _WHOLE and isinstance(value, dict):
+            typed = {str(name) for name in value}
+        elif typed is not None:
+            typed.add(path.removeprefix(f"{_WHOLE}."))
+    node = OmegaConf.select(cfg, _WHOLE, default=None)
+    if typed is not None and isinstance(node, DictConfig):
+        with open_dict(node):
+            for name in set(map(str, node)) - typed:
+                del node[name]
 
 
 def write_job(job: Job) -> None:

@@ -154,9 +154,8 @@ def _read_defaults(conf: Path, name: str) -> dict[str, str | None]:
         if isinstance(one, str) and one != "_self_":
             out |= _read_defaults(conf, one)
         elif isinstance(one, dict):
-            for key, value in one.items():
-                if not key.startswith(("override ", "optional ")):
-                    out[key] = value
+            within = ("override ", "optional ")  # of what another file chooses
+            out |= {key: value for key, value in one.items() if not key.startswith(within)}
     return out
 
 
