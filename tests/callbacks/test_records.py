@@ -1,6 +1,8 @@
 """Results on disk: what is read is what was written, and what is malformed is named."""
 
 import math
+import re
+import subprocess
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +18,7 @@ from posefilter.metrics.bop_results import (
     HEADER,
     PoseRow,
     choose_score,
+    measure_seconds,
     read_poses_csv,
     to_mesh,
     to_native,
@@ -128,6 +131,53 @@ def test_rows_are_native_and_leave_out_what_is_not_finite() -> None:
         (48, 0, 2, 2.0, -1.0),
     ]
     assert np.abs(rows[1].camera_from_native @ native_from_mesh - estimates[2]).max() < 1e-6
+
+
+def test_the_time_of_an_image_is_that_of_all_its_instances() -> None:
+    """As BOP has it, whose toolkit refuses rows of one image that differ in it."""
+    estimates = poses(3)
+    estimates[1, 0, 3] = np.nan  # takes time, too
+    none = np.zeros((0, 4, 4), np.float32), np.zeros(0, np.float32)
+    outcomes = [Outcome(i, estimates[i], 1.0, 0.25 * 2**i, *none) for i in range(3)]
+    records = [record(0), record(0), record(1)]
+    rows = to_rows(outcomes, records, lambda name: np.eye(4))
+    assert [(r.im_id, r.seconds) for r in rows] == [(0, 0.75), (1, 1.0)]
+
+
+def test_the_mean_time_is_that_of_images_and_not_of_their_objects() -> None:
+    def row(image: int, number: int, seconds: float) -> PoseRow:
+        return PoseRow(1, image, number, 1.0, np.eye(4), seconds)
+
+    own = [row(0, 1, 0.4), row(0, 2, 0.4), row(0, 3, 0.4), row(1, 1, 0.1)]
+    assert measure_seconds(own) == (pytest.approx(0.25), 0)
+    # times of one class each, of which two instances have the same
+    apart = [row(0, 1, 0.1), row(0, 1, 0.1), row(0, 2, 0.3), row(1, 1, 0.2)]
+    assert measure_seconds(apart) == (pytest.approx(0.3), 1)
+    unknown = [row(0, 1, -1.0), row(0, 2, 0.3), row(1, 1, math.nan)]
+    assert measure_seconds(unknown) == (None, 0)
+    assert measure_seconds([*unknown, row(2, 1, 0.5)]) == (0.5, 0)
+
+
+def test_files_of_several_objects_are_put_together_as_the_page_has_it(tmp_path: Path) -> None:
+    page = (Path(__file__).parents[2] / "docs" / "instances.md").read_text()
+    (command,) = re.findall(r"^    (\(head -1 outputs/bop/.*)$", page, re.MULTILINE)
+    estimates = poses(4)
+    # of the second object two instances in image 1
+    files = {"2": [(1, 0.25), (2, 0.5)], "5": [(1, 1.0), (1, 1.0)]}
+    for name, own in files.items():
+        folder = tmp_path / "outputs" / "bop" / name
+        folder.mkdir(parents=True)
+        rows = [
+            PoseRow(48, image, int(name), 0.5, estimates[i], seconds)
+            for i, (image, seconds) in enumerate(own)
+        ]
+        write_poses_csv(folder / "poses.csv", rows)
+    subprocess.run(command, shell=True, check=True, cwd=tmp_path)
+    rows = read_poses_csv(tmp_path / "outputs" / "bop" / "poses.csv")
+    found = [(r.im_id, r.obj_id, r.seconds) for r in rows]
+    assert found == [(1, 2, 1.25), (2, 2, 0.5), (1, 5, 1.25), (1, 5, 1.25)]
+    assert np.array_equal(rows[1].camera_from_native, estimates[1])
+    assert measure_seconds(rows) == (pytest.approx(0.875), 0)
 
 
 def test_outcomes_and_beliefs(tmp_path: Path) -> None:

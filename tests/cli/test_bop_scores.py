@@ -201,6 +201,21 @@ def test_estimates_of_the_meshs_frame_are_told(
     assert warning["median_mm_in_mesh_frame"] < 0.01
 
 
+def test_times_that_differ_within_an_image_are_told(
+    scenes: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """BOP's toolkit refuses them."""
+    rows = list_truths(scenes)
+    found = evaluate(rows, scenes, tmp_path / "same")
+    assert found["seconds_per_image"] == 1.0
+    assert "warning" not in capsys.readouterr().out
+    apart = [row._replace(seconds=0.5 + k) for k, row in enumerate(rows)]
+    evaluate(apart, scenes, tmp_path / "apart")
+    lines = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
+    (warning,) = [line for line in lines if line["event"] == "warning"]
+    assert warning["images"] == 2
+
+
 def test_of_equal_scores_the_first_estimate_counts(scenes: Path, tmp_path: Path) -> None:
     """As the challenge's own scoring has it, whose sort is stable: methods without confidences
     list their best estimate first.

@@ -1,6 +1,7 @@
 """Results of a test by image: poses in the format of the BOP challenge, and whole beliefs."""
 
 import math
+from collections import defaultdict
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -83,7 +84,8 @@ def to_rows(
 ) -> list[PoseRow]:
     """Return the estimates as lines of a results file.
 
-    The score is as `choose_score` has it.
+    The score is as `choose_score` has it.  BOP's time is that of an image: of an image that shows
+    several instances, that of all of its outcomes.
     Estimates that are not finite are left out, and so count as missed.
 
     Args:
@@ -92,15 +94,20 @@ def to_rows(
         native_from_mesh: Given a class, the transform (4, 4) from the frame of the mesh file to the
             dataset's own object frame [m].
     """
+    seconds = defaultdict[tuple[int, int], float](float)
+    for outcome in outcomes:
+        record = records[outcome.frame_id]
+        seconds[record.scene_id, record.im_id] += outcome.seconds
     rows = []
     for outcome in outcomes:
         if not np.isfinite(outcome.estimate).all():
             continue
         record = records[outcome.frame_id]
         pose = to_native(outcome.estimate, native_from_mesh(record.object))
-        seconds = outcome.seconds if math.isfinite(outcome.seconds) else -1.0
+        image = record.scene_id, record.im_id
+        spent = seconds[image] if math.isfinite(seconds[image]) else -1.0
         score = choose_score(outcome.probability, outcome.score)
-        rows.append(PoseRow(record.scene_id, record.im_id, record.obj_id, score, pose, seconds))
+        rows.append(PoseRow(*image, record.obj_id, score, pose, spent))
     return rows
 
 

@@ -14,7 +14,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from posefilter.callbacks.errors import ErrorTable, make_rows
 from posefilter.callbacks.records import Records, to_rows, write_beliefs
-from posefilter.cli.bop_scores import assign_estimates, score_targets, sort_rows
+from posefilter.cli.bop_scores import assign_estimates, score_targets
 from posefilter.cli.build import build_data, check_share, make_trainer, quiet
 from posefilter.cli.checkpoints import method_of, read_checkpoint
 from posefilter.cli.components import changed, changes, chosen
@@ -35,7 +35,12 @@ from posefilter.data.module import PoseDataModule
 from posefilter.errors import UserError
 from posefilter.geometry.boxes import box_of_pose
 from posefilter.metrics.bop import BopErrors
-from posefilter.metrics.bop_results import read_poses_csv, to_mesh, write_poses_csv
+from posefilter.metrics.bop_results import (
+    measure_seconds,
+    read_poses_csv,
+    to_mesh,
+    write_poses_csv,
+)
 from posefilter.metrics.bop_targets import Target, read_targets
 from posefilter.metrics.collect import BoxIoU, PoseErrors
 from posefilter.metrics.errors import add
@@ -253,11 +258,16 @@ def _of_estimates(job: Job) -> tuple[dict[str, Any], dict[str, Path]]:
     other = 1000 * float(np.median(in_mesh_frame))
     warn_of_frame(found["add"]["median_mm"], other, job.cfg.console)
     tested = {(r.scene_id, r.im_id, r.obj_id) for r in data.records("test")}
-    best = (own[0] for key, own in sort_rows(rows).items() if key in tested)
-    seconds = [row.seconds for row in best if row.seconds >= 0]
+    seconds, mixed = measure_seconds([row for row in rows if row[:3] in tested])
+    if mixed:
+        sentence = (
+            f"the rows of an image differ in their time in {mixed} images; BOP's time is that of "
+            "the whole image, and its toolkit refuses others (docs/instances.md adds them up)"
+        )
+        warn(job.cfg.console, sentence, images=mixed)
     results = found | bop.compute()
     results |= {"iou": float(iou.compute()), "particles_on_object": None}
-    results["seconds_per_image"] = sum(seconds) / len(seconds) if seconds else None
+    results["seconds_per_image"] = seconds
     results["belief"] = None
     if job.cfg.targets is not None:
         results["bop"] = score_targets(rows, targets, data.records("test"), data)

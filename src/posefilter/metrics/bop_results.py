@@ -5,6 +5,7 @@ estimate (<https://bop.felk.cvut.cz/challenges>, "Formats").
 import csv
 import math
 import sys
+from collections import defaultdict
 from collections.abc import Sequence
 from decimal import Decimal, InvalidOperation
 from pathlib import Path
@@ -18,6 +19,7 @@ from posefilter.geometry.rigid import rigid
 from posefilter.limits import open_text
 
 _NEAREST = 0.02  # [m] median distance of objects
+_SAME_SECONDS = 0.001  # by which times of one image may differ, as bop_toolkit has it
 _LEAST = -sys.float_info.max  # not all who read such files know infinity
 HEADER = ("scene_id", "im_id", "obj_id", "score", "R", "t", "time")
 
@@ -43,6 +45,33 @@ def choose_score(probability: float | None, score: float) -> float:
     """
     numbers = (probability, score)
     return next((float(x) for x in numbers if x is not None and math.isfinite(x)), _LEAST)
+
+
+def measure_seconds(rows: Sequence[PoseRow]) -> tuple[float | None, int]:
+    """Return the mean time of an image, and in how many images rows differ in it.
+
+    BOP's time is that of an image, and the same in all of its rows.  Where rows differ, they are
+    taken for times of one class each, and are added up.
+
+    Args:
+        rows: Of a results file; images of which a row has no time are left out.
+
+    Returns:
+        The mean [s], None where no image has a time; and the number of images.
+    """
+    images = defaultdict[tuple[int, int], list[PoseRow]](list)
+    for row in rows:
+        images[row.scene_id, row.im_id].append(row)
+    means, mixed = list[float](), 0
+    for own in images.values():
+        times = [row.seconds for row in own]
+        if not all(time >= 0 for time in times):
+            continue
+        differ = max(times) - min(times) > _SAME_SECONDS
+        by_class = {row.obj_id: row.seconds for row in own}
+        means.append(sum(by_class.values()) if differ else times[0])
+        mixed += differ
+    return sum(means) / len(means) if means else None, mixed
 
 
 def to_native(camera_from_object: np.ndarray, native_from_mesh: np.ndarray) -> np.ndarray:
