@@ -1,6 +1,8 @@
 """The bench of held-out renders: kinds of objects, and rows that stay in their file."""
 
 import csv
+import re
+from collections import defaultdict
 from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType
@@ -8,6 +10,8 @@ from types import ModuleType
 import numpy as np
 import pytest
 import torch
+
+HOME = Path(__file__).parents[2]
 
 
 @pytest.fixture
@@ -70,6 +74,53 @@ def test_the_file_in_the_docs_stays_as_it_is_without_rows(
     assert copy.read_bytes() == held_out.ROWS.read_bytes()
     with copy.open(newline="") as file:
         assert {len(cells) for cells in csv.reader(file)} == {len(held_out.HEAD)}
+
+
+@pytest.fixture
+def shipped(held_out: ModuleType) -> dict[str, dict[str, str]]:
+    """Return the rows of the files that ship, by object."""
+    with held_out.ROWS.open(newline="") as file:
+        rows = [row for row in csv.DictReader(file) if row["visibility"] == "BOP"]
+    return {row["object"]: row for row in rows if row["object"] == row["weights"]}
+
+
+def test_the_page_of_weights_has_the_rows_of_the_files(shipped: dict[str, dict[str, str]]) -> None:
+    text = (HOME / "weights" / "README.md").read_text()
+    _, _, text = text.partition("## Accuracy on held-out")
+    lines = dict(re.findall(r"^\| `(\w+)\.ckpt` \| (.*) \|$", text, re.MULTILINE))
+    form = "{} | {} ({} to {}) | {} ({} to {}) | {} % | {} % | {} mm"
+    columns = [
+        "scenes",
+        *(f"{e} AUC{end}" for e in ("ADD", "ADD-S") for end in ("", " from", " to")),
+    ]
+    columns += ["ADD < 0.1 d %", "ADD-S < 0.1 d %", "median mm"]
+    wanted = {name: form.format(*map(row.get, columns)) for name, row in shipped.items()}
+    assert lines == wanted
+
+
+def test_the_page_of_photographs_has_the_loss_of_small_objects(
+    shipped: dict[str, dict[str, str]],
+) -> None:
+    kinds = {"small": "fully in the frame", "truncated": "truncated", "in frame": "the others"}
+    text = (HOME / "docs" / "results" / "photographs.md").read_text()
+    count = {k: sum(int(row[f"{k}: images"]) for row in shipped.values()) for k in kinds}
+    shares, means = [count["small"] / sum(count.values())], defaultdict[str, list[str]](list)
+    for error in ("ADD", "ADD-S"):
+        lost = {
+            kind: sum(
+                int(row[f"{kind}: images"]) * (100 - float(row[f"{kind}: {error} AUC"] or 0))
+                for row in shipped.values()
+            )
+            for kind in kinds
+        }
+        shares.append(lost["small"] / sum(lost.values()))
+        for kind, start in kinds.items():
+            means[start].append(f"{100 - lost[kind] / count[kind]:.1f}")
+    (sentence,) = re.findall(r"^Small objects still lose most: .*$", text, re.MULTILINE)
+    assert re.findall(r"(\d+) %", sentence) == [f"{100 * share:.0f}" for share in shares]
+    for start, areas in means.items():
+        (row,) = re.findall(rf"^\| {start}[^|]* \| ([\d.]+) \| ([\d.]+) \|$", text, re.MULTILINE)
+        assert [*row] == areas
 
 
 def test_two_checkpoints_are_compared_on_the_same_images(held_out: ModuleType) -> None:
