@@ -36,6 +36,7 @@ SILENT = ("logger", "callbacks", "hydra", "out", "resume", "console", "threads")
 SILENT_KEYS = ("data.root", "data.meshes", "data.workers", "data.generate.workers")
 BY_VISIBILITY = {"shipped"}  # tables that have rows of ranges of visibility
 ORDER = {ablation.name: number for number, ablation in enumerate(ABLATIONS)}
+WHOLE = ("seed", "steps", "tested step")  # two seeds that differ late are two runs
 ROW = ("table", "method", "variant", "changed", "seed")  # what tells a row from others
 RENAMED = {  # columns, by their names before
     "along a line %": "first-axis share %",
@@ -147,8 +148,17 @@ def split_by_visibility(run: Run) -> list[Run]:
     return [run, *parts]
 
 
+def write_figure(name: str, value: float | None) -> str:
+    """Return a column's figure: to six digits, a seed or a number of steps with all of them; empty
+    where there is none.
+    """
+    if value is None:
+        return ""
+    return f"{value:.0f}" if name in WHOLE else f"{value:.6g}"
+
+
 def make_rows(table: str, runs: Iterable[Run]) -> list[dict[str, str]]:
-    """Return a table's runs as rows: figures to six digits, empty where a run has none."""
+    """Return a table's runs as rows."""
     rows = []
     if table in BY_VISIBILITY:
         runs = [part for run in runs for part in split_by_visibility(run)]
@@ -158,7 +168,7 @@ def make_rows(table: str, runs: Iterable[Run]) -> list[dict[str, str]]:
             dict(
                 zip(("table", "method", "variant", "changed"), (table, *describe(run)), strict=True)
             )
-            | {name: "" if value is None else f"{value:.6g}" for name, value in figures.items()}
+            | {name: write_figure(name, value) for name, value in figures.items()}
             | {"device": run.get("device") or ""}
             | {"torch": (run.get("versions") or {}).get("torch") or ""}
         )

@@ -36,6 +36,18 @@ def test_what_decides_no_result_is_left_out(collect: ModuleType, tmp_path: Path)
     assert collect.describe(run) == wanted
 
 
+def test_seeds_that_differ_in_a_late_digit_are_rows_of_their_own(
+    collect: ModuleType, tmp_path: Path
+) -> None:
+    for seed in (20260101, 20260102):
+        write_run(tmp_path / str(seed), 0.9, "model=patch_pf")
+        path = tmp_path / str(seed) / "metrics.json"
+        path.write_text(json.dumps({**json.loads(path.read_text()), "seed": seed}))
+    rows = collect.make_rows("own", collect.read_runs(tmp_path))
+    assert {row["seed"] for row in rows} == {"20260101", "20260102"}
+    assert {row["on object %"] for row in rows} == {"90"}
+
+
 def test_names_of_before_are_those_of_today(collect: ModuleType, tmp_path: Path) -> None:
     write_run(tmp_path / "a", 0.9, "model=pose_pf", "filter.first_particles=100")
     (run,) = collect.read_runs(tmp_path)
