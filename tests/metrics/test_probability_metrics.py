@@ -23,6 +23,18 @@ def test_calibration_error_is_the_mean_gap_of_the_bins() -> None:
     assert math.isnan(calibration_error(probability[:0], right[:0]))
 
 
+def test_calibration_error_is_that_of_the_diagram_at_the_limits_of_bins_too() -> None:
+    """A limit is no float32: 0.3 lies below that of torch's linspace."""
+    probability = torch.tensor([0.3, 0.38, 0.22], dtype=torch.float64)
+    right = torch.tensor([True, False, False])
+    gaps = [
+        one["frames"] * abs(one["probability"] - one["right"])
+        for one in list_bins(probability, right)
+    ]
+    assert float(calibration_error(probability, right)) == pytest.approx(sum(gaps) / 3)
+    assert sum(gaps) == pytest.approx(2 * 0.16 + 0.22)
+
+
 def test_labels_drawn_from_the_probabilities_have_little_calibration_error() -> None:
     probability = torch.rand(20_000, dtype=torch.float64)
     right = torch.rand(20_000, dtype=torch.float64) < probability

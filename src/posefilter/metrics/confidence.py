@@ -4,7 +4,6 @@ from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
-from torchmetrics.functional.classification import binary_calibration_error
 
 from posefilter.metrics.collect import Rows
 from posefilter.metrics.diagnostics import auroc
@@ -22,16 +21,18 @@ def calibration_error(probability: Tensor, correct: Tensor, bins: int = _BINS) -
 
     (M,), (M,) bool -> (); NaN without predictions.
     """
-    given = probability.double().contiguous()
-    return binary_calibration_error(given, correct.long(), n_bins=bins)
+    known = list_bins(probability, correct, bins)
+    gaps = [one["frames"] * abs(one["probability"] - one["right"]) for one in known]
+    return torch.tensor(sum(gaps) / len(probability) if gaps else torch.nan, dtype=torch.float64)
 
 
 def list_bins(probability: Tensor, correct: Tensor, bins: int = _BINS) -> list[dict[str, float]]:
     """Return the reliability diagram: of each bin that is not empty its ends, its number of frames,
-    mean probability and share that is right.
+    mean probability and share that is right. A probability at a limit is of the bin above.
 
     (M,), (M,) bool.
     """
+    probability = probability.double()
     bin_of_each = (probability * bins).long().clamp(0, bins - 1)
     out = []
     for k in bin_of_each.unique().tolist():
