@@ -118,6 +118,22 @@ def test_the_table_of_errors_has_each_number_in_its_column(scenes: Path, tmp_pat
             assert math.isnan(getattr(row, name))
 
 
+def test_estimates_have_errors_by_visibility_as_a_method_has(scenes: Path, tmp_path: Path) -> None:
+    """Of the images of a range alone; a missed one is infinitely off."""
+    found = evaluate(list_truths(scenes)[:3], scenes, tmp_path / "one")
+    table = read_errors(tmp_path / "one" / "scores" / FILE)
+    assert found["by_visibility"]
+    for name, own in found["by_visibility"].items():
+        low, high = map(float, name.split("-"))
+        inside = [
+            row for row in table if low <= row.visibility < high or row.visibility == high == 1
+        ]
+        assert own["instances"] == len(inside)
+        near = sum(row.add_mm < 20 for row in inside)
+        assert own["add"]["recall_2cm"] == pytest.approx(100 * near / len(inside))
+    assert any(own["add"]["recall_2cm"] < 100 for own in found["by_visibility"].values())
+
+
 def test_a_file_of_targets_says_how_many_count(scenes: Path, tmp_path: Path) -> None:
     rows = list_truths(scenes)
     first = rows[0]

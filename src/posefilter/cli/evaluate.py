@@ -42,7 +42,7 @@ from posefilter.metrics.bop_results import (
     write_poses_csv,
 )
 from posefilter.metrics.bop_targets import Target, read_targets
-from posefilter.metrics.collect import BoxIoU, PoseErrors
+from posefilter.metrics.collect import BoxIoU, ErrorsByVisibility, PoseErrors
 from posefilter.metrics.errors import add
 from posefilter.metrics.image_errors import FILE as ERRORS
 from posefilter.metrics.image_errors import ImageError, write_errors
@@ -218,6 +218,7 @@ def _of_estimates(job: Job) -> tuple[dict[str, Any], dict[str, Path]]:
         )
     models = [data.object_model(i) for i in range(len(data.objects))]
     errors, bop, iou = PoseErrors(models), BopErrors(models), BoxIoU()
+    by_visibility = ErrorsByVisibility(models)
     in_mesh_frame = list[float]()  # ADD [m], were they of the meshes' frames
     table = list[ImageError]()
     for batch in data.test_dataloader():
@@ -236,6 +237,7 @@ def _of_estimates(job: Job) -> tuple[dict[str, Any], dict[str, Path]]:
             points = models[int(batch.object_id[i])].points.double()
             in_mesh_frame += add(as_it_is, truth, points).tolist()
         errors.update(poses, batch.camera_from_object, batch.object_id)
+        by_visibility.update(errors.last(), batch.visibility)
         height, width = batch.rgb.shape[-2:]
         bop.update(poses, batch.camera_from_object, batch.intrinsics, width, batch.object_id)
         scores = [nan if row is None else row.score for row in estimates]
@@ -268,7 +270,7 @@ def _of_estimates(job: Job) -> tuple[dict[str, Any], dict[str, Path]]:
     results = found | bop.compute()
     results |= {"iou": float(iou.compute()), "particles_on_object": None}
     results["seconds_per_image"] = seconds
-    results["belief"] = None
+    results |= {"belief": None, "by_visibility": by_visibility.compute()}
     if job.cfg.targets is not None:
         results["bop"] = score_targets(rows, targets, data.records("test"), data)
         if count := results["bop"]["left_out"]:
