@@ -284,11 +284,12 @@ def test_a_file_of_targets_is_the_split_that_is_tested(
     write_poses_csv(tmp_path / "poses.csv", [PoseRow(3, 1, 5, 1.0, pose(), 1.0)])
     typed = [f"estimates={tmp_path / 'poses.csv'}", "targets=targets.json", "data=bop"]
     typed += [f"data.root={tmp_path / 'bop'}", f"data.meshes={tmp_path / 'meshes'}"]
-    typed += ["data.options.split=test", "data.mesh_scale=1", f"out={tmp_path / 'out'}"]
-    assert run_command("evaluate", arguments=typed) == 0
-    found = json.loads((tmp_path / "out" / "metrics.json").read_text())
-    assert (found["instances"], found["missed"], found["bop"]["targets"]) == (1, 0, 1)
-    assert found["add"]["recall_01d"] == 100
+    typed += ["data.options.split=test", "data.mesh_scale=1"]
+    for name, more in {"out": [], "seeded": ["data.split_seed=1"]}.items():
+        assert run_command("evaluate", arguments=[*typed, *more, f"out={tmp_path / name}"]) == 0
+        found = json.loads((tmp_path / name / "metrics.json").read_text())
+        assert (found["instances"], found["missed"], found["bop"]["targets"]) == (1, 0, 1)
+        assert found["add"]["recall_01d"] == 100
     assert "BOP average recall" in capfd.readouterr().out
     wrong = [one.replace("targets.json", "none.json") for one in typed[:-1]]
     assert run_command("evaluate", arguments=[*wrong, f"out={tmp_path / 'other'}"]) == 2

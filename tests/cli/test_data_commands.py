@@ -64,6 +64,29 @@ def test_a_split_that_is_typed_replaces_the_checkpoints(tmp_path: Path, command:
     assert data_settings(job, own, None).split == {**DEFAULTS, "val": 0.2}
 
 
+def test_a_seed_alone_is_no_split(tmp_path: Path) -> None:
+    """Every frame of another folder is tested with it, too, and not a tenth of its scenes."""
+    root = f"data.root={tmp_path / 'scenes'}"
+    began = [root, "data.split={train: 0.6, val: 0.2, test: 0.2}", "data.split_seed=5"]
+    trained = compose_job("train", CONF, began, tmp_path).cfg
+    own = {"data": {**OmegaConf.to_container(trained.data, resolve=True), "augment": {}}}
+
+    def settle(recipe: dict[str, object], *typed: str) -> tuple[object, int]:
+        job = compose_job("evaluate", CONF, ["data=scenes", *typed], tmp_path)
+        found = data_settings(job, recipe, "carton")
+        return found.split, found.split_seed
+
+    other = f"data.root={tmp_path / 'other'}"
+    assert settle(own, other) == ({"test": 1.0}, 5)
+    assert settle(own, other, "data.split_seed=7") == ({"test": 1.0}, 7)
+    assert settle({}, other, "data.split_seed=7") == ({"test": 1.0}, 7)
+    shares = {"train": 0.6, "val": 0.2, "test": 0.2}
+    assert settle(own, root) == (shares, 5)
+    assert settle(own, root, "data.split_seed=7") == (shares, 7)
+    # the same shares of another seed would be scenes that were learned from
+    assert settle(own, root, "data.split={train: 0.6, val: 0.2, test: 0.2}") == (shares, 5)
+
+
 def test_a_split_that_is_no_mapping_is_refused_in_words(tmp_path: Path) -> None:
     asked = ["data=fat", f"data.root={tmp_path}", "data.split=half"]
     with pytest.raises(

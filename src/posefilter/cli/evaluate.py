@@ -23,7 +23,7 @@ from posefilter.cli.folders import keep_training_results, read_results
 from posefilter.cli.job import Job
 from posefilter.cli.learned import warn_of_learned
 from posefilter.cli.machine import settle
-from posefilter.cli.plain import to_plain
+from posefilter.cli.plain import key_of, to_plain
 from posefilter.cli.progress_bar import progress
 from posefilter.cli.recipe import check_data
 from posefilter.cli.results import record, show, write_json
@@ -300,7 +300,7 @@ def list_targets(job: Job, settings: DictConfig) -> list[Target] | None:
     if str(job.cfg.targets) == ALL:
         return None
     path, targets = read_targets(str(job.cfg.targets), Path(str(settings.root)))
-    if not any("data.split" in one for one in job.overrides):
+    if not any(_is_of_split(key_of(one).removeprefix("data.")) for one in job.overrides):
         settings.split = {"test": str(path)}
     return targets
 
@@ -326,8 +326,8 @@ def data_settings(
 
     Without `data=` they are those that the checkpoint was trained with: its held-out test split,
     and it must lie where `check_data` lets it. With it, object and image size are the checkpoint's
-    unless typed; the split is the checkpoint's where it was trained on the same folder, and else
-    every frame is tested, as it is of another of BOP's splits.
+    unless typed; the split and its seed are the checkpoint's where it was trained on the same
+    folder, and else every frame is tested, as it is of another of BOP's splits.
     """
     said = to_plain(job.cfg.data) if job.cfg.get("data") else {}
     own = trained.get("data") or {}
@@ -335,7 +335,7 @@ def data_settings(
         o.lstrip("+~").partition("=") for o in job.overrides if o.lstrip("+~").startswith("data.")
     ]
     typed = {key.removeprefix("data."): value.strip("'\"") for key, _, value in pairs}
-    chosen, typed_split = "_target_" in said, any(key.startswith("split") for key in typed)
+    chosen, typed_split = "_target_" in said, any(map(_is_of_split, typed))
     if own and not chosen and "_target_" not in own:
         raise UserError(
             "data: exported weights carry no dataset; give "
@@ -361,6 +361,7 @@ def data_settings(
         )
         if not typed_split:
             settings["split"] = before.split if same else {part: 1.0}
+        if "split_seed" not in typed and (same or not typed_split):
             settings["split_seed"] = before.get("split_seed", settings.get("split_seed", 0))
         if "limit_test" not in typed:
             settings["limit_test"] = before.limit_test if same else None
@@ -375,6 +376,11 @@ def data_settings(
     if data.get("generate") and not any(key.startswith("generate") for key in typed):
         data.generate = None  # a mistyped folder must not be filled with a new dataset
     return data
+
+
+def _is_of_split(key: str) -> bool:
+    """Return whether a setting of the data says what is tested, as `split_seed` alone does not."""
+    return key == "split" or key.startswith("split.")
 
 
 def _bop_split(data: Mapping[str, Any]) -> Any:
