@@ -9,7 +9,6 @@ tables of the documents.
 """
 
 import csv
-import json
 import re
 import sys
 from collections.abc import Callable, Iterable
@@ -19,6 +18,7 @@ from typing import Any
 from programs import HOME, make_parser, run_command
 
 from posefilter.cli.ablations import ABLATIONS
+from posefilter.cli.folders import own_metrics
 from posefilter.cli.renamed import rename
 from posefilter.metrics.registry import find_metric, read_number
 
@@ -68,10 +68,16 @@ COLUMNS: dict[str, Callable[[Run], float | None]] = {
 
 
 def read_runs(folder: Path) -> list[Run]:
-    """Return the metrics of every run below a folder, each with its overrides under `choices`."""
+    """Return the metrics of every run below a folder, each with its overrides under `choices`; of a
+    run that was evaluated in its own folder those of its own test.
+    """
     runs = []
     for path in sorted(folder.rglob("metrics.json")):
-        run: Run = json.loads(path.read_text())
+        if (path.parents[1] / "checkpoints").is_dir():
+            continue  # an evaluation that a run which went on has moved into its folder
+        run: Run = own_metrics(path.parent)
+        if not run:
+            continue  # of a training that has not ended
         if "signs" in run:  # the name of before
             run["diagnostics"] = run.pop("signs")
         typed = [

@@ -48,6 +48,24 @@ def test_seeds_that_differ_in_a_late_digit_are_rows_of_their_own(
     assert {row["on object %"] for row in rows} == {"90"}
 
 
+def test_an_evaluation_in_a_runs_folder_is_no_row(collect: ModuleType, tmp_path: Path) -> None:
+    """`evaluate.py checkpoint=RUN` writes there, and keeps the run's own results beside."""
+    run, begun = tmp_path / "run", tmp_path / "begun"
+    write_run(run, 0.9, "model=patch_pf", "filter.particles=50")
+    (run / "metrics.json").rename(run / "metrics_train.json")
+    for folder in (run, begun):
+        (folder / "checkpoints").mkdir(parents=True)
+        found = {"particles_on_object": 0.1, "overrides": ["checkpoint=run"], "seed": 0}
+        (folder / "metrics.json").write_text(json.dumps({**found, "command": "evaluate"}))
+    write_run(run / "evaluation_1", 0.2, "checkpoint=run")
+    (row,) = collect.make_rows("own", collect.read_runs(tmp_path))
+    assert (row["method"], row["changed"], row["on object %"]) == (
+        "patch_pf",
+        "filter.particles=50",
+        "90",
+    )
+
+
 def test_names_of_before_are_those_of_today(collect: ModuleType, tmp_path: Path) -> None:
     write_run(tmp_path / "a", 0.9, "model=pose_pf", "filter.first_particles=100")
     (run,) = collect.read_runs(tmp_path)
