@@ -217,7 +217,7 @@ def test_estimates_of_the_meshs_frame_are_told(
     assert warning["median_mm_in_mesh_frame"] < 0.01
 
 
-def test_times_that_differ_within_an_image_are_told(
+def test_times_that_differ_within_an_image_are_named(
     scenes: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """BOP's toolkit refuses them."""
