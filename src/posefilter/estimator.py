@@ -182,7 +182,7 @@ class Estimator:
                 method, batch = self.methods[number], batches[number]
                 belief, draws = method.calibrate_belief(each.belief, each.assessment)
                 trace = Trace((), (), (), belief)
-                run = Run(method, batch, trace, spent, each.assessment, draws=draws)
+                run = Run(method, batch, trace, spent, each.assessment, each.size, draws=draws)
                 result = make_result(run, 0, self.costs, self.pose_tolerance)
                 mask = resize_mask(each.mask, size).cpu().numpy()
                 # a conformal set holds for the filter that was calibrated, this one is smaller

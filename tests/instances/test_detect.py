@@ -52,6 +52,9 @@ class Toy:
         brightness = self.rank * trace.belief.score.double().clamp(0, 1)
         return Assessment(brightness, brightness)
 
+    def measure_scale_ratio(self, trace: Trace, batch: Batch, visible: Tensor) -> None:
+        return None
+
 
 class SimpleFilter:
     """What the search needs of a filter."""

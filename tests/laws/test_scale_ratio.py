@@ -111,6 +111,8 @@ def test_an_estimate_is_measured_once_by_each_output_of_a_network() -> None:
     assert measure_scale_ratio(pose, *seen, MODEL) is first
     changed = measure_scale_ratio(pose, *other, MODEL)
     assert float(changed.scale) != float(first.scale)
+    fewer = seen[1]._replace(valid=seen[1].valid & False)
+    assert math.isnan(float(measure_scale_ratio(pose, seen[0], fewer, MODEL).scale))
     again = measure_scale_ratio(POSE.clone(), *seen, MODEL)
     assert again is not first
     assert torch.equal(again.scale, first.scale)

@@ -208,6 +208,24 @@ def test_a_depth_that_is_a_fourth_too_large_is_measured_and_not_believed(
     assert "intrinsics" in warning
 
 
+def test_instances_of_a_wrong_size_are_not_believed(estimator: posefilter.Estimator) -> None:
+    """Each is measured by itself: a second box, a fourth farther away, is of its own size."""
+    rgb, depth, K = read_scene(0, ONE_MODE)
+    (right,) = estimator.predict(rgb, depth, K, instances=1)
+    assert right.scale_ratio == pytest.approx(1.0, abs=0.08)
+    assert right.verdict == "found"
+    below = np.concatenate([rgb, rgb]), np.concatenate([depth, 1.25 * depth])
+    found = {
+        bool(one.mask[: len(rgb)].any()): one for one in estimator.predict(*below, K, instances=2)
+    }
+    assert found[True].scale_ratio == pytest.approx(1.0, abs=0.08)
+    assert (found[True].verdict, found[True].wrong_size) == ("found", False)
+    assert found[False].scale_ratio == pytest.approx(1.25, abs=0.08)
+    assert found[False].wrong_size
+    assert found[False].verdict == "unsure"
+    assert "depth_scale" in found[False].warnings[-1]
+
+
 @pytest.mark.slow
 def test_an_image_of_one_color_or_depth_is_doubted(estimator: posefilter.Estimator) -> None:
     """A black one is answered from the depth alone, with a presence that nothing supports; in one

@@ -44,9 +44,10 @@ class ScaleRatio(NamedTuple):
         return off & (self.gain > _LEAST_GAIN) & (self.explained > _EXPLAINED)
 
 
-# of estimates, as long as those are there: the output of the network that it was measured by, and
-# the size, which is asked for when an answer is chosen and again for the result
-_KNOWN: MutableMapping[Tensor, tuple[weakref.ref[Tensor], ScaleRatio]] = WeakIdKeyDictionary()
+# of estimates, as long as those are there: the output of the network and the cells that it was
+# measured by, and the size, which is asked for when an answer is chosen and again for the result
+_KNOWN: MutableMapping[Tensor, tuple[weakref.ref[Tensor], weakref.ref[Tensor], ScaleRatio]]
+_KNOWN = WeakIdKeyDictionary()
 
 
 def measure_scale_ratio(
@@ -65,13 +66,13 @@ def measure_scale_ratio(
         object_model: The object.
     """
     known = _KNOWN.get(best)
-    if known is not None and known[0]() is coordinates.logit:
-        return known[1]
+    if known is not None and known[0]() is coordinates.logit and known[1]() is cells.valid:
+        return known[2]
     found = [
         _measure(best[i], _seen(coordinates, cells, i), object_model) for i in range(len(best))
     ]
     size = ScaleRatio(*(torch.stack(part) for part in zip(*found, strict=True)))
-    _KNOWN[best] = weakref.ref(coordinates.logit), size
+    _KNOWN[best] = weakref.ref(coordinates.logit), weakref.ref(cells.valid), size
     return size
 
 

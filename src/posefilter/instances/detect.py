@@ -10,6 +10,7 @@ import torch
 from torch import Generator, Tensor
 
 from posefilter.confidence.calibration import Assessment
+from posefilter.confidence.scale_ratio import ScaleRatio
 from posefilter.confidence.second_look import measure_worth
 from posefilter.confidence.tolerance import PoseTolerance
 from posefilter.confidence.verdicts import Costs, Verdict, decide
@@ -41,6 +42,7 @@ class Detection(NamedTuple):
     visible: Tensor  # (H, W) bool, its visible pixels, of the first method's image
     mask: Tensor  # (H, W) bool, those that are its own: a more probable answer keeps the others
     within: float | None = None  # that it is there and within a tolerance, where one was given
+    size: ScaleRatio | None = None  # by its visible pixels; None where the method cannot tell
 
     @property
     def probability(self) -> float:
@@ -176,7 +178,9 @@ def _search(
         # seen to have too few of its own
         whole = resize_mask(visible, grid)
         within = _assess_within(job, assessment)
-        one = Detection(job.number, trace.belief, assessment, whole, whole, within)
+        answer = Trace((), (), (), trace.belief, encoding=encoding)
+        size = job.method.measure_scale_ratio(answer, image, visible[None])
+        one = Detection(job.number, trace.belief, assessment, whole, whole, within, size)
         one = one if bool((visible & ~hidden).any()) and is_there(one, costs) else None
     job.exhausted = one is None
     job.seconds += time.perf_counter() - start

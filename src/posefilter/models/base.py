@@ -266,9 +266,17 @@ class PoseEstimator(Module):
 
         return score
 
-    def measure_scale_ratio(self, trace: Trace, batch: Batch) -> ScaleRatio | None:
+    def measure_scale_ratio(
+        self, trace: Trace, batch: Batch, visible: Tensor | None = None
+    ) -> ScaleRatio | None:
         """Return how large the object appears, relative to its mesh; None where the method cannot
-        tell.  Arguments as of `collect_features`.
+        tell.
+
+        Args:
+            trace: As of `collect_features`.
+            batch: Likewise.
+            visible: (B, H, W) bool, the pixels that are the object's own; None: all that the method
+                takes for it, as where an image shows one of it at most.
         """
         return None
 

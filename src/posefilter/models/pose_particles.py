@@ -11,7 +11,7 @@ from posefilter.confidence.scale_ratio import ScaleRatio, measure_scale_ratio
 from posefilter.errors import UserError
 from posefilter.geometry.spaces import PoseSpace
 from posefilter.models.base import PoseEstimator
-from posefilter.nets.coordinates import Cells, Coordinates, HasCoordinates
+from posefilter.nets.coordinates import Cells, Coordinates, HasCoordinates, gather_pixels
 from posefilter.nets.proposals import ObjectCoordinateNet
 from posefilter.types import Batch, BeliefBatch, ObjectModel, ParticleOutput, Particles, Step, Trace
 
@@ -64,11 +64,16 @@ class PoseParticles(PoseEstimator):
             return features
         return features | measure_coordinates(*self._see_estimate(trace, batch))
 
-    def measure_scale_ratio(self, trace: Trace, batch: Batch) -> ScaleRatio | None:
+    def measure_scale_ratio(
+        self, trace: Trace, batch: Batch, visible: Tensor | None = None
+    ) -> ScaleRatio | None:
         """Return how large the object appears by such a network; None without one."""
         if self._coordinate_net is None:
             return None
-        return measure_scale_ratio(*self._see_estimate(trace, batch))
+        best, coordinates, cells, object_model = self._see_estimate(trace, batch)
+        if visible is not None:
+            cells = cells._replace(valid=cells.valid & gather_pixels(visible, cells))
+        return measure_scale_ratio(best, coordinates, cells, object_model)
 
     def _see_estimate(
         self, trace: Trace, batch: Batch

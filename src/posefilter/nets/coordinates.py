@@ -61,6 +61,21 @@ def whole_cells(image: Tensor) -> Tensor:
     return F.pad(image, (0, -W % STRIDE, 0, -H % STRIDE))
 
 
+def gather_pixels(mask: Tensor, cells: Cells) -> Tensor:
+    """Return of each cell whether the pixel whose depth was taken is in a mask.
+
+    Args:
+        mask: (B, H, W) bool, of the images or of whole cells.
+        cells: Measured points.
+
+    Returns:
+        (B, h, w) bool.
+    """
+    mask = whole_cells(mask)
+    u, v = cells.pixel.long().flatten(1, 2).unbind(-1)
+    return mask.flatten(1).gather(1, v * mask.shape[-1] + u).view_as(cells.valid)
+
+
 def true_coordinates(
     cells: Cells, mask: Tensor, camera_from_object: Tensor, center: Tensor, radius: float
 ) -> tuple[Tensor, Tensor, Tensor]:
@@ -81,8 +96,7 @@ def true_coordinates(
     """
     mask = whole_cells(mask)[:, 0]
     on = mask[:, CENTRAL::STRIDE, CENTRAL::STRIDE]
-    u, v = cells.pixel.long().flatten(1, 2).unbind(-1)
-    lifted = mask.flatten(1).gather(1, v * mask.shape[-1] + u).view_as(on)
+    lifted = gather_pixels(mask, cells)
     R, t = camera_from_object[:, None, :3, :3], camera_from_object[:, None, None, :3, 3]
     truth = ((cells.point - t) @ R - center) / radius
     return truth, on, on & lifted & cells.valid & within_bounds(truth)
