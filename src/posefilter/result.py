@@ -57,8 +57,8 @@ class Result:
         warnings: What makes the estimate implausible, in words; empty where nothing does.
         scale_ratio: How large the object appears, relative to its mesh: 1 where the depth and the
             intrinsics are right.  NaN where the method cannot tell, or too few pixels show it.  A
-            track has that of the frame in which it began, or was found again; one that contradicts
-            is measured anew in frames with the whole image.
+            track has that of the frame in which it began, or was found again; one that contradicts,
+            or is NaN, is measured anew in frames with the whole image.
         wrong_size: Whether it appears so much larger or smaller that depth or intrinsics must be
             wrong.  `probability` supposes that they are right, so "found" becomes "unsure".
         blank: Why the image cannot be judged, in words: it is of one color, or its depth is the

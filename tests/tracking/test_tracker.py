@@ -456,6 +456,10 @@ def test_wrong_inputs_are_doubted_beyond_the_first_frame(monkeypatch: pytest.Mon
     assert found[-1].scale_ratio == pytest.approx(0.7)
     tracker.reset()
     assert tracker.tracks[0].scale_ratio is None
+    scales[0] = math.nan  # of an object that is far away at first, or half in the frame
+    assert all(math.isnan(tracker.update(RGB, DEPTH, K).scale_ratio) for _ in range(5))
+    scales[0] = 1.25
+    assert [tracker.update(RGB, DEPTH, K) for _ in range(4)][-1].wrong_size
 
 
 def test_later_frames_may_be_covered_and_cameras_be_of_any_kind() -> None:

@@ -312,7 +312,7 @@ class Track:
         refine = self._refine(settings.quadratic_fits, turns)
         due = self._margin_is_due
         found, trace = self._filter(batch, encoding, start, follow, refine, against, due)
-        if not windowed and self._has_wrong_size:  # the inputs may be right now, or have been
+        if not windowed and self._size_is_open:
             size = self.method.measure_scale_ratio(trace, batch)
             if size is not None and bool(size.scale.isfinite().all()):
                 return found._replace(size=size)
@@ -472,8 +472,12 @@ class Track:
         return every > 0 and self._probes[0] % every == 0
 
     @property
-    def _has_wrong_size(self) -> bool:
-        return self.scale_ratio is not None and bool(self.scale_ratio.contradicts().any())
+    def _size_is_open(self) -> bool:
+        """Whether the scale ratio is to be measured anew: too little of the object was seen, or the
+        inputs were wrong, and may be right now.
+        """
+        ratio = self.scale_ratio
+        return ratio is not None and bool((ratio.scale.isnan() | ratio.contradicts()).any())
 
     @property
     def _whole_is_due(self) -> bool:
