@@ -328,6 +328,12 @@ def test_a_wrong_depth_scale_is_told_once(
     for line in warned:
         assert line["frame"] == "frame_8"
         assert any("times as large as its mesh" in one for one in line["warnings"])
+    rows = [json.loads(line) for line in (tmp_path / "out/poses.jsonl").read_text().splitlines()]
+    assert rows[0]["scale_ratio"] == pytest.approx(factor, abs=0.1)
+    with (tmp_path / "out/tracks.csv").open() as file:
+        ratios = [row["scale_ratio"] for row in csv.DictReader(file)]
+    assert ratios == [str(row["scale_ratio"] or "") for row in rows]
+    assert [row["verdict"] for row in rows] == [None, None, "unsure", None]  # not calibrated
 
 
 def test_without_the_viewers_library_a_view_is_refused_before_anything_is_done(

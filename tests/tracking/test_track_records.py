@@ -1,6 +1,7 @@
 """The figures of a track's rows."""
 
 import weakref
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -38,6 +39,8 @@ def test_rows_of_a_long_video_keep_no_belief() -> None:
     row = records.make_row("v", "1", (0, 1, 1), result, None)
     wanted = np.sqrt(np.diag(result.covariance)).tolist()
     assert records.describe_row(row)["standard_deviations"] == wanted
+    doubted = records.summarize_result(replace(result, blank="it is black"))
+    assert records.describe_row(row._replace(result=doubted))["verdict"] == "unsure"
     belief = weakref.ref(result.belief)
     del result
     assert belief() is None

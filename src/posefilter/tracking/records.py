@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 
+from posefilter.confidence.verdicts import Verdict
 from posefilter.files import open_whole_text
 from posefilter.metrics.errors import add, add_s
 from posefilter.metrics.scores import summarize
@@ -20,8 +21,9 @@ from posefilter.tracking.track import TrackResult
 from posefilter.types import ObjectModel
 
 _COLUMNS = (
-    "video", "frame", "scene_id", "im_id", "obj_id", "object", "status", "score", "objectness",
-    "presence", "probability", "particles", "add_mm", "add_s_mm", "seconds",
+    "video", "frame", "scene_id", "im_id", "obj_id", "object", "status", "verdict", "score",
+    "objectness", "presence", "probability", "scale_ratio", "particles", "add_mm", "add_s_mm",
+    "seconds",
 )  # fmt: skip
 
 
@@ -33,10 +35,12 @@ class TrackSummary:
     pose: np.ndarray  # (4, 4) camera_from_object [m]
     status: str
     is_tracked: bool
+    verdict: Verdict | None
     score: float
     probability: float | None
     presence: float | None
     objectness: float
+    scale_ratio: float
     particles: int
     seconds: float
     warnings: tuple[str, ...]
@@ -149,11 +153,12 @@ def describe_row(row: TrackRow) -> dict[str, Any]:
     """Return a row as plain content, a line of poses.jsonl."""
     result = row.result
     own = ("video", "frame", "scene_id", "im_id", "obj_id")
-    measured = ("score", "objectness", "presence", "probability", "particles")
+    measured = ("score", "objectness", "presence", "probability", "scale_ratio", "particles")
     return {
         **{name: getattr(row, name) for name in own},
         "object": result.object,
         "status": result.status,
+        "verdict": result.verdict,
         "camera_from_object": result.pose.tolist(),
         **{name: getattr(result, name) for name in measured},
         "standard_deviations": result.standard_deviations,
