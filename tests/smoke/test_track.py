@@ -10,6 +10,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -21,13 +22,15 @@ from omegaconf import OmegaConf
 
 from posefilter.cli.command import compose_job, run_command
 from posefilter.cli.track import make_settings
-from posefilter.cli.track_log import TrackLog, to_pose_row
+from posefilter.cli.track_log import to_pose_row
 from posefilter.data.sequences import VideoFrame
 from posefilter.errors import UserError
 from posefilter.locks import LOCK, hold
 from posefilter.metrics.bop_results import read_poses_csv
 from posefilter.tracking.records import TrackRow
 from posefilter.tracking.settings import TrackerSettings
+from posefilter.tracking.track import TrackResult
+from posefilter.tracking.tracker import Tracker
 
 pytestmark = pytest.mark.slow
 
@@ -66,27 +69,25 @@ def test_a_row_is_scored_as_predict_and_evaluate_score(
     result: Any = SimpleNamespace(
         object="a", pose=np.eye(4), score=7.5, probability=probability, seconds=0.1
     )
-    row = TrackRow("video", "8", 0, 8, 1, result, None, np.nan, np.nan)
+    row = TrackRow("video", "8", 0, 8, 1, result, 0.1, None, np.nan, np.nan)
     assert to_pose_row(row, lambda _: np.eye(4)).score == score
 
 
-def test_the_time_of_a_row_is_that_of_its_image(tmp_path: Path) -> None:
-    """As BOP's evaluation demands: its own check refuses other files."""
-    rows = []
-    for video, frame, name, status, seconds in (
-        ("left", "8", "a", "tracked", 1.0),
-        ("left", "8", "b", "tracked", 2.0),
-        ("left", "8", "c", "lost", 4.0),
-        ("left", "9", "a", "tracked", 8.0),
-        ("right", "8", "a", "tracked", 16.0),
-    ):
-        result: Any = SimpleNamespace(
-            object=name, pose=np.eye(4), score=1.0, probability=None, seconds=seconds,
-            is_tracked=status != "lost",
-        )  # fmt: skip
-        rows.append(TrackRow(video, frame, 0, int(frame), 1, result, None, np.nan, np.nan))
-    poses = TrackLog(tmp_path, lambda _: np.eye(4)).list_poses(rows)
-    assert [pose.seconds for pose in poses] == [7, 7, 8, 16]
+def test_the_time_of_a_row_is_that_of_its_image_by_the_clock(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As BOP has it: times of objects that are tracked side by side overlap."""
+    update_all = Tracker.update_all
+
+    def update(self: Tracker, *frame: Any) -> list[TrackResult]:
+        return [replace(one, seconds=1000.0) for one in update_all(self, *frame)]
+
+    monkeypatch.setattr(Tracker, "update_all", update)
+    typed = [*COMMON, f"frames={folder}", CAMERA, f"out={tmp_path / 'out'}"]
+    before = time.perf_counter()
+    assert run_command("track", HOME, typed) == 0
+    times = [row.seconds for row in read_poses_csv(tmp_path / "out" / "poses.csv")]
+    assert 0 < sum(times) < time.perf_counter() - before
 
 
 def test_a_folder_of_pictures_is_tracked(folder: Path, tmp_path: Path) -> None:

@@ -23,7 +23,7 @@ def make_row(x: float, truth: bool = True, tracked: bool = True) -> TrackRow:
     )
     real = np.eye(4)
     real[2, 3] = 1
-    return TrackRow("v", "1", 0, 1, 1, result, real if truth else None, x, x)
+    return TrackRow("v", "1", 0, 1, 1, result, 0.1, real if truth else None, x, x)
 
 
 def test_jitter_is_of_frames_that_follow_each_other() -> None:
@@ -36,7 +36,7 @@ def test_jitter_is_of_frames_that_follow_each_other() -> None:
 
 def test_rows_of_a_long_video_keep_no_belief() -> None:
     result = Tracker(make_toy()[1]).update(RGB, DEPTH, K)
-    row = records.make_row("v", "1", (0, 1, 1), result, None)
+    row = records.make_row("v", "1", (0, 1, 1), result, 0.1, None)
     wanted = np.sqrt(np.diag(result.covariance)).tolist()
     assert records.describe_row(row)["standard_deviations"] == wanted
     doubted = records.summarize_result(replace(result, blank="it is black"))

@@ -1,6 +1,7 @@
 """Follow objects through videos: poses, figures, and an annotated video."""
 
 import math
+import time
 from collections.abc import Iterator, Sequence
 from contextlib import closing
 from pathlib import Path
@@ -148,7 +149,9 @@ def follow(
     with closing(tracker), writer, recorder, watch as bar:
         task, room = bar.add_task(video.name, total=len(video)), 0
         for frame in read_frames(video, tracker, cfg):
+            start = time.perf_counter()
             results = tracker.update_all(frame.rgb, frame.depth, frame.intrinsics)
+            seconds = time.perf_counter() - start
             room = room or measure_room(frame, results, shapes)
             writer.add(draw_frame(frame, results, shapes), room)
             recorder.add(frame.rgb, frame.depth, frame.intrinsics, list_seen(results))
@@ -158,7 +161,7 @@ def follow(
                 truth = frame.truth.get(result.object)
                 image = f"frame {frame.name}"
                 say_doubt(result, image, doubted, cfg.console, frame=frame.name)
-                rows.append(make_row(video.name, frame.name, ids, result, truth))
+                rows.append(make_row(video.name, frame.name, ids, result, seconds, truth))
             log.add(rows)
             bar.advance(task)
 

@@ -1,7 +1,6 @@
 """What has been tracked so far, in two files that a killed `track.py` leaves behind."""
 
 import os
-from collections import defaultdict
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
@@ -46,17 +45,8 @@ class TrackLog:
         self._header = ""
 
     def list_poses(self, rows: Sequence[TrackRow]) -> list[PoseRow]:
-        """Return the rows of the results file: of frames in which the object was tracked. BOP's
-        time is that of an image, all objects together.
-        """
-        seconds = defaultdict[tuple[str, str], float](float)
-        for row in rows:
-            seconds[row.video, row.frame] += row.result.seconds
-        return [
-            to_pose_row(row, self._native)._replace(seconds=seconds[row.video, row.frame])
-            for row in rows
-            if row.result.is_tracked
-        ]
+        """Return the rows of the results file: of frames in which the object was tracked."""
+        return [to_pose_row(row, self._native) for row in rows if row.result.is_tracked]
 
     def close(self) -> None:
         """Close the two files, which stay."""
@@ -70,10 +60,12 @@ class TrackLog:
 
 
 def to_pose_row(row: TrackRow, native_from_mesh: NativeFromMesh) -> PoseRow:
-    """Return a row of the results file, in the dataset's own object frame."""
+    """Return a row of the results file, in the dataset's own object frame; BOP's time is that of an
+    image, all objects together.
+    """
     pose = to_native(row.result.pose, native_from_mesh(row.result.object))
     score = choose_score(row.result.probability, row.result.score)
-    return PoseRow(row.scene_id, row.im_id, row.obj_id, score, pose, row.result.seconds)
+    return PoseRow(row.scene_id, row.im_id, row.obj_id, score, pose, row.image_seconds)
 
 
 def check_unused(folder: Path) -> None:

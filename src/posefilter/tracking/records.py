@@ -56,13 +56,19 @@ class TrackRow(NamedTuple):
     im_id: int
     obj_id: int
     result: TrackSummary
+    image_seconds: float  # by the clock, of all objects
     truth: np.ndarray | None  # (4, 4) camera_from_object [m], where it is known
     add: float  # error of the pose [m]; NaN without a truth
     add_s: float
 
 
 def make_row(
-    video: str, frame: str, ids: tuple[int, int, int], result: TrackResult, truth: np.ndarray | None
+    video: str,
+    frame: str,
+    ids: tuple[int, int, int],
+    result: TrackResult,
+    image_seconds: float,
+    truth: np.ndarray | None,
 ) -> TrackRow:
     """Return the row of a frame's result.  ids: of scene, image and object, as BOP has them."""
     errors = (math.nan, math.nan)
@@ -70,7 +76,8 @@ def make_row(
         pair = (torch.from_numpy(result.pose)[None], torch.from_numpy(truth).double()[None])
         points = result.object_model.points.cpu()
         errors = (float(add(*pair, points.double())), float(add_s(*pair, points)))
-    return TrackRow(video, frame, *ids, summarize_result(result), truth, *errors)
+    summary = summarize_result(result)
+    return TrackRow(video, frame, *ids, summary, image_seconds, truth, *errors)
 
 
 def summarize_result(result: TrackResult) -> TrackSummary:
