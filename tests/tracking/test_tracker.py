@@ -601,8 +601,8 @@ def test_several_objects_give_a_list_and_the_seed_decides() -> None:
         ({"elsewhere_penalty": -1.0}, "elsewhere_penalty=-1.0 must be a number, at least 0"),
         ({"jump_penalty": math.nan}, "jump_penalty=nan must be a number, at least 0, at most"),
         ({"lost_below": "0.2"}, "lost_below='0.2' must be a number, at least 0, at most 1"),
-        ({"follow": None}, "follow=None must be of FilterSettings"),
-        ({"motion": 5.0}, "motion=5.0 must be of ConstantVelocity"),
+        ({"follow": None}, "follow=None must be a posefilter.tracking.settings.FilterSettings"),
+        ({"motion": 5.0}, "motion=5.0 must be a posefilter.tracking.motion.ConstantVelocity"),
     ],
 )
 def test_impossible_settings_are_refused(wrong: dict[str, Any], told: str) -> None:

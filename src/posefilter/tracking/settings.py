@@ -22,7 +22,7 @@ def check_settings(settings: Any, place: str) -> None:
         value, allowed = getattr(settings, one.name), find_range(f"{place}.{one.name}")
         kind = cast(type, one.type)
         if not (isinstance(value, kind) if allowed is None else allowed.holds(value)):
-            expected = f"of {kind.__name__}" if allowed is None else allowed
+            expected = f"a {kind.__module__}.{kind.__name__}" if allowed is None else allowed
             raise UserError(f"tracker: {one.name}={value!r} must be {expected}")
 
 
