@@ -727,11 +727,17 @@ def test_mosaics_and_yuv_become_color() -> None:
     u = 128 + 112 / 255 * (blue - red_blue) / 0.886
     v = 128 + 112 / 255 * (red - red_blue) / 0.701
     yuyv = np.tile(np.array([[y, u], [y, v]]).round().astype(np.uint8), (8, 4, 1))
-    for name, packed in (("yuv422_yuy2", yuyv), ("yuv422", yuyv[..., ::-1])):
+    layouts = {
+        "yuv422_yuy2": yuyv,
+        "yuyv": yuyv,
+        "yuv422": yuyv[..., ::-1],
+        "uyvy": yuyv[..., ::-1],
+    }
+    for name, packed in layouts.items():
         message = make_image(np.ascontiguousarray(packed), name)
         assert np.abs(decode_color(message, "/c").astype(int) - flat).max() <= 2
-    with pytest.raises(UserError, match="of an odd width"):
-        decode_color(make_image(np.ascontiguousarray(yuyv[:, :7]), "yuv422"), "/c")
+        with pytest.raises(UserError, match="of an odd width"):
+            decode_color(make_image(np.ascontiguousarray(yuyv[:, :7]), name), "/c")
     depth = cv2.imencode(".png", np.full((8, 8), 1000, np.uint16))[1].tobytes()
     with pytest.raises(UserError, match="is of depth, not of color"):
         decode_color(make_compressed("16UC1; png compressed ", depth), "/c")

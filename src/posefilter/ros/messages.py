@@ -48,8 +48,8 @@ _COLORS: dict[str, tuple[int, int | None]] = {  # channels, and what OpenCV make
     "bgra8": (4, cv2.COLOR_BGRA2RGB),
     "mono8": (1, cv2.COLOR_GRAY2RGB),
     "8UC3": (3, cv2.COLOR_BGR2RGB),
-    "yuv422": (2, cv2.COLOR_YUV2RGB_UYVY),
-    "yuv422_yuy2": (2, cv2.COLOR_YUV2RGB_YUY2),
+    **dict.fromkeys(("yuv422", "uyvy"), (2, cv2.COLOR_YUV2RGB_UYVY)),  # the second since Iron
+    **dict.fromkeys(("yuv422_yuy2", "yuyv"), (2, cv2.COLOR_YUV2RGB_YUY2)),
     **{name: (1, code) for name, code in _BAYER.items()},
 }
 _SATURATED = 65535  # what cameras write into 16 bits beyond their range
@@ -89,7 +89,7 @@ def decode_color(message: Any, topic: str) -> np.ndarray:
     rows = _read_rows(message, topic, "color", np.dtype("u1"), channels)
     if code is None:
         return rows
-    if rows.shape[1] % 2 and encoding.startswith("yuv422"):
+    if rows.shape[1] % 2 and channels == 2:
         raise UserError(f"color={topic}: {encoding} of an odd width, {rows.shape[1]}")
     return np.asarray(cv2.cvtColor(rows, code))
 
