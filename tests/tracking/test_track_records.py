@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from tests.tracking.toy import DEPTH, RGB, K, make_toy
 
+from posefilter.cli.track import list_figures
 from posefilter.tracking import records
 from posefilter.tracking.records import TrackRow, compute_figures
 from posefilter.tracking.tracker import Tracker
@@ -44,3 +45,9 @@ def test_rows_of_a_long_video_keep_no_belief() -> None:
     belief = weakref.ref(result.belief)
     del result
     assert belief() is None
+
+
+def test_the_time_of_an_object_is_not_shown_as_that_of_the_frame() -> None:
+    """Other objects take theirs."""
+    figures = compute_figures([make_row(0.0), make_row(0.001)], make_toy()[0].object_model)
+    assert list_figures(figures)[-1] == ("its part of a frame", "100 ms")

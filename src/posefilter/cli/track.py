@@ -301,5 +301,5 @@ def list_figures(figures: dict[str, Any]) -> list[tuple[str, str]]:
             jitter = f"{figures['jitter_mm']:.1f} mm, {figures['jitter_deg']:.2f} degrees"
             out.append(("jitter", jitter))
     if figures["frames_per_second"] is not None:
-        out.append(("a frame", f"{1000 * figures['seconds_tracked']:.0f} ms"))
+        out.append(("its part of a frame", f"{1000 * figures['seconds_tracked']:.0f} ms"))
     return out
