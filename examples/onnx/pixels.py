@@ -10,6 +10,7 @@ from poses import (
     draw_poses,
     fit_rigid,
     open_export,
+    print_estimate,
     read_arguments,
     resample,
     softmax,
@@ -103,5 +104,4 @@ def run(session, given):
 
 if __name__ == "__main__":
     place, *images = read_arguments("pixels")
-    pose, score, _ = PixelFilter(place).estimate(*images)
-    print(np.array2string(pose, precision=4, suppress_small=True), f"score {score:.2f}")
+    print_estimate(PixelFilter(place), images)

@@ -26,18 +26,24 @@ def open_export(folder, threads):
     return json.loads((Path(folder) / "filter.json").read_text()), *networks
 
 
+class ImageError(ValueError):
+    """An image that no pose can be estimated in, as of a covered sensor; the next one may do."""
+
+
 def take_image(settings, rgb, depth, intrinsics):
     """An image as `encode` reads it: RGB (H, W, 3) uint8, depth (H, W) [m], (3, 3)."""
     size = (settings["camera"][1], settings["camera"][0])
+    if rgb.dtype != np.uint8 or rgb.shape[2:] != (3,):
+        raise ImageError(f"the image is {rgb.dtype} {rgb.shape}; expected uint8 (H, W, 3), RGB")
     if depth.shape != rgb.shape[:2]:
         color, deep = ("x".join(map(str, x.shape[1::-1])) for x in (rgb, depth))
-        sys.exit(f"the image has {color} pixels, its depth {deep}")
+        raise ImageError(f"the image has {color} pixels, its depth {deep}")
     if depth.shape != size:
-        sys.exit(f"exported for images of {size[1]}x{size[0]}: export with width=, height=")
+        raise ImageError(f"exported for images of {size[1]}x{size[0]}: export with width=, height=")
     depth = np.float32(np.where(depth < 100, depth, 0))  # what is farther is not measured
     known = depth[depth > 0]
     if not len(known) or not 0.05 <= np.median(known) <= 30:
-        sys.exit("depth: no pixel has any, or it is not in meters")
+        raise ImageError("depth: no pixel has any, or it is not in meters")
     return {"rgb": rgb, "depth": depth, "intrinsics": np.float32(intrinsics)}
 
 
@@ -518,7 +524,15 @@ def read_arguments(particles):
     return folder, color, z, np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
 
 
+def print_estimate(particle_filter, images):
+    """Print the pose of a `PoseFilter` or a `PixelFilter`."""
+    try:
+        pose, score, *_ = particle_filter.estimate(*images)
+    except ImageError as error:
+        sys.exit(str(error))
+    print(np.array2string(pose, precision=4, suppress_small=True), f"score {score:.2f}")
+
+
 if __name__ == "__main__":
     place, *images = read_arguments("poses")
-    pose, score, *_ = PoseFilter(place).estimate(*images)
-    print(np.array2string(pose, precision=4, suppress_small=True), f"score {score:.2f}")
+    print_estimate(PoseFilter(place), images)

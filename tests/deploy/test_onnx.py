@@ -456,18 +456,29 @@ def test_the_examples_mistakes_are_one_line(
         poses.read_arguments("poses")
 
 
-def test_depth_that_is_not_in_meters_is_refused(poses: ModuleType) -> None:
+def test_an_image_that_cannot_be_used_is_refused_and_the_next_one_may_be(
+    poses: ModuleType, capsys
+) -> None:
+    """A program that takes the example's class goes on after it; the example itself ends."""
     rgb, depth, K = read_scene()
     settings = {"camera": [depth.shape[1], depth.shape[0]]}
     kept = poses.take_image(settings, rgb, np.where(depth > 0, depth, np.nan), K)["depth"]
     np.testing.assert_array_equal(kept, depth)
     for wrong in ((1000 * depth).astype(np.uint16), 1000 * depth, depth / 100, 0 * depth):
-        with pytest.raises(SystemExit, match="not in meters"):
+        with pytest.raises(poses.ImageError, match="not in meters"):
             poses.take_image(settings, rgb, wrong, K)
-    with pytest.raises(SystemExit, match="exported for images of 320x240"):
+    with pytest.raises(poses.ImageError, match="exported for images of 320x240"):
         poses.take_image(settings, rgb[1:], depth[1:], K)
-    with pytest.raises(SystemExit, match="the image has 320x240 pixels, its depth 320x239"):
+    with pytest.raises(poses.ImageError, match="the image has 320x240 pixels, its depth 320x239"):
         poses.take_image(settings, rgb, depth[1:], K)
+    with pytest.raises(poses.ImageError, match=r"float64 \(240, 320, 3\); expected uint8"):
+        poses.take_image(settings, rgb / 255, depth, K)
+    example = SimpleNamespace(estimate=lambda *image: poses.take_image(settings, *image))
+    with pytest.raises(SystemExit, match=r"^depth: no pixel has any"):
+        poses.print_estimate(example, (rgb, 0 * depth, K))
+    example.estimate = lambda *image: (np.eye(4), 1.5)
+    poses.print_estimate(example, (rgb, depth, K))
+    assert "score 1.50" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(
