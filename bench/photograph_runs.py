@@ -43,9 +43,9 @@ SIXTH = "data_sixth"
 SIXTH_SPLIT = "data.split={train: 0.96, val: 0.02, test: 0.02}"
 SIXTH_RUNS = {
     "mustard": (2006, 2800, 7000), "tuna": (2007, 2800, 7000),
-    "chef": (2002, 2000, 4000), "gelatin": (2009, 2800, 6000),
+    "chef": (2002, 2800, 7000), "gelatin": (2009, 2800, 6000),
     "drill": (2035, 2800, 7000), "banana": (2011, 2800, 7000),
-    "meat": (2010, 2800, 7000), "soup": (2005, 2800, 0), "mug": (2025, 2800, 7000),
+    "meat": (2010, 2800, 7000), "soup": (2005, 2800, 7000), "mug": (2025, 2800, 7000),
     "hammer": (2048, 2800, 6000), "sugar": (2004, 2800, 7000),
 }  # fmt: skip
 
@@ -214,8 +214,6 @@ def plan() -> list[Run]:
     sized = f"{_STEPS}.1.object_size_probability=0.25"
     tested = "data.min_visibility_test=0.1 data.limit_val=48 data.limit_test=2"
     for name, (_, _, count) in SIXTH_RUNS.items():
-        if not count:  # scenes alone, in which others stand
-            continue
         last = shipped(f"{name}_y", count)
         words = last.words.replace(short, f"data/augment=camera_magnified {tested}")
         words = f"{words} {sized} trainer.val_check_interval={count if count < 7000 else 3500}"
