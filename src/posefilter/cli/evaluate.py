@@ -329,21 +329,21 @@ def data_settings(
     unless typed; the split and its seed are the checkpoint's where it was trained on the same
     folder, and else every frame is tested, as it is of another of BOP's splits.
     """
-    said = to_plain(job.cfg.data) if job.cfg.get("data") else {}
+    given = to_plain(job.cfg.data) if job.cfg.get("data") else {}
     own = trained.get("data") or {}
     pairs = [
         o.lstrip("+~").partition("=") for o in job.overrides if o.lstrip("+~").startswith("data.")
     ]
     typed = {key.removeprefix("data."): value.strip("'\"") for key, _, value in pairs}
-    chosen, typed_split = "_target_" in said, any(map(_is_of_split, typed))
+    chosen, typed_split = "_target_" in given, any(map(_is_of_split, typed))
     if own and not chosen and "_target_" not in own:
         raise UserError(
             "data: exported weights carry no dataset; give "
             "data=fat|ycb_video|bop|scenes and data.root=DIR"
         )
-    settings = dict(said) if chosen else changed({"data": own}, {"data": said})["data"]
+    settings = dict(given) if chosen else changed({"data": own}, {"data": given})["data"]
     if "split" in typed:  # typed whole, it replaces the checkpoint's
-        settings["split"] = said["split"]
+        settings["split"] = given["split"]
     settings["augment"] = {}
     tree = {**trained, "data": settings, "seed": trained.get("seed", 0)}
     if chosen and own:

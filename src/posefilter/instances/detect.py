@@ -178,10 +178,11 @@ def _search(
         # seen to have too few of its own
         whole = resize_mask(visible, grid)
         within = _assess_within(job, assessment)
-        answer = Trace((), (), (), trace.belief, encoding=encoding)
-        size = job.method.measure_scale_ratio(answer, image, visible[None])
-        one = Detection(job.number, trace.belief, assessment, whole, whole, within, size)
-        one = one if bool((visible & ~hidden).any()) and is_there(one, costs) else None
+        seen = Detection(job.number, trace.belief, assessment, whole, whole, within)
+        if bool((visible & ~hidden).any()) and is_there(seen, costs):
+            answer = Trace((), (), (), trace.belief, encoding=encoding)
+            size = job.method.measure_scale_ratio(answer, image, visible[None])
+            one = seen._replace(size=size)
     job.exhausted = one is None
     job.seconds += time.perf_counter() - start
     return one

@@ -96,7 +96,7 @@ def _find_type_flaw(sample: Any, objects: int) -> str:
     """Return what has another type or shape than a `Sample` says, "" where nothing has."""
     if not isinstance(sample, Sample):
         return f"returned a {type(sample).__name__}, not a posefilter.data.frames.Sample"
-    size: Any = getattr(sample.rgb, "shape", ())
+    size = sample.rgb.shape if isinstance(sample.rgb, np.ndarray) else ()
     height, width = size[:2] if len(size) == 3 and size[2] == 3 else (0, 0)
     wanted = {
         "rgb": ("u1", (height, width, 3), "uint8 (H, W, 3), red first, 0 to 255"),
