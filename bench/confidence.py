@@ -233,7 +233,7 @@ def tabulate(rows: list[dict[str, Any]]) -> str:
 
 def tabulate_errors(rows: list[dict[str, Any]]) -> str:
     """Return what beliefs say of right estimates, and how far these are off, as a table."""
-    head = ("object", "right", "off, median", "said at 95 %, median", "within the translation")
+    head = ("object", "right", "off, median", "stated at 95 %, median", "within the translation")
     head += ("the rotation", "ellipsoids of 50 and 95 %")
     lines = []
     own = [row for row in rows if row.get("right") and "off" in row]

@@ -13,7 +13,7 @@ then the same frames tracked, in one process. Figures are means over seeds, of s
 the first four, and ± is the standard error of such a mean. Times are the processor's of this
 process, so that other work on the machine changes them little; the ratio of the two is what to go
 by. Then the frames once more, of which six are replaced by those of another scene: how many are
-said to show the object, and after how many frames it is recovered. Sequences are folders of
+declared to show the object, and after how many frames it is recovered. Sequences are folders of
 generate.py with moving= and fully_occluded_frames=: there the losses are in the frames. With
 --together so many objects of a scene are tracked at once by one thread, by two that torch shares an
 operation's work out to, and by two processes that have an object each: in turn, by the clock, on an
@@ -60,13 +60,13 @@ HEAD = (
     "ratio",
 )  # fmt: skip
 LOSSES = (
-    "object", "scene", "away", "said to be there", "of these in the first", "recovered after",
+    "object", "scene", "away", "declared present", "of these in the first", "recovered after",
     "presence with it", "without",
 )  # fmt: skip
 SEQUENCES = (
     "object", "sequence", "step mm", "step degrees", "frames", "covered", "single: ADD AUC",
     "tracked: ADD AUC", "random walk", "single: ADD-S AUC", "tracked: ADD-S AUC", "lost",
-    "covered: said to be there", "recovered after",
+    "covered: declared present", "recovered after",
 )  # fmt: skip
 RANDOM_WALK = ConstantVelocity(velocity_gain=0, max_noise_scale=1)
 BELIEFS = (
@@ -148,7 +148,7 @@ def measure_loss(
     """Replace some frames by another scene's, and track.
 
     Returns:
-        In how many of these the object was said to be there, and how many of them are the delay of
+        In how many of these the object was declared present, and how many of them are the delay of
         a loss; in which of its own that came back it is found, or None; the least presence of a
         frame with it, and the greatest of one without.
     """
