@@ -46,6 +46,21 @@ def test_two_processes_train_one_method(tmp_path: Path, tiny_scenes: Path, insta
 
 
 @pytest.mark.slow
+def test_only_the_first_process_draws(tmp_path: Path, tiny_scenes: Path) -> None:
+    """The others have no event file to draw into."""
+    out = tmp_path / "run"
+    more = "callbacks=default", "logger=tensorboard"
+    words, clean = command(tiny_scenes, out, 2, *more)
+    words.remove("callbacks=checkpoints")
+    done = subprocess.run(
+        words, capture_output=True, text=True, timeout=600, cwd=tmp_path, env=clean
+    )
+    assert done.returncode == 0, done.stderr
+    assert "Traceback" not in done.stderr
+    assert list(out.rglob("test_trajectories_*.jpg"))
+
+
+@pytest.mark.slow
 def test_two_processes_agree_on_when_to_write_what_a_run_goes_on_from(
     tmp_path: Path, tiny_scenes: Path
 ) -> None:

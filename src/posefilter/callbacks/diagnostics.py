@@ -72,7 +72,7 @@ class Diagnostics(BudgetedCallback):
         self, trainer: Trainer, method: PoseEstimator, trace: Trace, batch: Batch, number: int
     ) -> None:
         """Draw and animate the first batch's trajectories."""
-        if number == 0 and has_pixel_particles(trace):
+        if number == 0 and trainer.is_global_zero and has_pixel_particles(trace):
             self.draw(trainer, method, trace, batch)
 
     def on_test_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
