@@ -22,7 +22,7 @@ from posefilter.instances.pixels import resize_mask
 from posefilter.limits import MOST_SIDE
 from posefilter.models.base import PoseEstimator
 from posefilter.precision import in_float32
-from posefilter.result import Result, Run, collect_results, make_result
+from posefilter.result import Result, Run, collect_results, make_result, pool_scale_ratios
 from posefilter.types import Batch, ObjectModel, Trace
 
 _MOST = 100  # instances of an object
@@ -175,14 +175,18 @@ class Estimator:
             asked = self.costs, self.pose_tolerance
             found, seconds = detect(self.methods, batches, counts, *asked)
             many = Counter(each.number for each in found)
-            before, results = Counter[int](), []
+            before, results, runs = Counter[int](), [], []
             for each in found:
                 number = each.number
                 spent = seconds[number] / many[number]
                 method, batch = self.methods[number], batches[number]
                 belief, draws = method.calibrate_belief(each.belief, each.assessment)
                 trace = Trace((), (), (), belief)
-                run = Run(method, batch, trace, spent, each.assessment, each.size, draws=draws)
+                runs.append(
+                    Run(method, batch, trace, spent, each.assessment, each.size, draws=draws)
+                )
+            for each, run in zip(found, pool_scale_ratios(runs), strict=True):
+                number = each.number
                 result = make_result(run, 0, self.costs, self.pose_tolerance)
                 mask = resize_mask(each.mask, size).cpu().numpy()
                 # a conformal set holds for the filter that was calibrated, this one is smaller

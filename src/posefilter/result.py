@@ -13,7 +13,7 @@ from posefilter.belief.belief import belief_over
 from posefilter.belief.summaries import check_probability
 from posefilter.confidence.calibration import Assessment, Calibration
 from posefilter.confidence.conformal import Conformal
-from posefilter.confidence.scale_ratio import ScaleRatio
+from posefilter.confidence.scale_ratio import ScaleRatio, pool_gains
 from posefilter.confidence.tolerance import RIGHT, PoseTolerance, check_pose_tolerance
 from posefilter.confidence.verdicts import (
     Costs,
@@ -30,6 +30,8 @@ from posefilter.types import Batch, BeliefBatch, ObjectModel, Trace
 
 if TYPE_CHECKING:
     from posefilter.figures.overlay import Shape
+
+_THERE = 0.5  # presence from which an object's scale ratio counts for the others of its image
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -60,7 +62,8 @@ class Result:
             track has that of the frame in which it began, or was found again; one that contradicts,
             or is NaN, is measured anew in frames with the whole image.
         wrong_size: Whether it appears so much larger or smaller that depth or intrinsics must be
-            wrong.  `probability` supposes that they are right, so "found" becomes "unsure".
+            wrong; where several objects are found in one image, together with those of the same
+            scale ratio.  `probability` supposes that they are right, so "found" becomes "unsure".
         blank: Why the image cannot be judged, in words: it is of one color, or its depth is the
             same everywhere.  The verdict is then "unsure".  Empty where it can be.
         seconds: The filter's time for this image, its share of a batch.
@@ -353,8 +356,27 @@ def collect_results(
         costs: What errors cost; None: the default.
         pose_tolerance: What a right pose is; None: an ADD below 0.1 diameters.
     """
-    count = len(runs[0].batch.rgb)
+    runs, count = pool_scale_ratios(runs), len(runs[0].batch.rgb)
     return [[make_result(run, i, costs, pose_tolerance) for run in runs] for i in range(count)]
+
+
+def pool_scale_ratios(runs: Sequence[Run]) -> list[Run]:
+    """Return runs on the same images with scale ratios that are judged together: see
+    `posefilter.confidence.scale_ratio.pool_gains`.
+    """
+    out = list(runs)
+    known = [
+        (i, run.size, run.found.presence)
+        for i, run in enumerate(runs)
+        if run.size is not None and run.found is not None
+    ]
+    if len(known) > 1:
+        numbers, sizes, presences = zip(*known, strict=True)
+        sizes = [ScaleRatio(*(part.cpu() for part in size)) for size in sizes]
+        there = [presence.cpu() > _THERE for presence in presences]
+        for i, size in zip(numbers, pool_gains(sizes, there), strict=True):
+            out[i] = out[i]._replace(size=size)
+    return out
 
 
 def make_result(

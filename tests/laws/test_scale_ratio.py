@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from posefilter.confidence.scale_ratio import ScaleRatio, measure_scale_ratio
+from posefilter.confidence.scale_ratio import ScaleRatio, measure_scale_ratio, pool_gains
 from posefilter.geometry.pose import make_pose, transform
 from posefilter.geometry.rotation import exp_so3
 from posefilter.nets.coordinates import Cells, Coordinates
@@ -116,3 +116,25 @@ def test_an_estimate_is_measured_once_by_each_output_of_a_network() -> None:
     again = measure_scale_ratio(POSE.clone(), *seen, MODEL)
     assert again is not first
     assert torch.equal(again.scale, first.scale)
+
+
+def test_objects_of_one_image_that_agree_on_a_scale_decide_together() -> None:
+    """None of the first two contradicts the inputs by itself."""
+    ratios = [
+        ScaleRatio(*torch.tensor([[scale], [gain], [explained]]))
+        for scale, gain, explained in (
+            (1.25, 5.0, 0.9),
+            (1.22, 6.0, 0.9),
+            (1.0, 0.0, 0.9),  # appears in its size
+            (math.nan, 0.0, 0.0),  # shows too little
+            (1.25, 30.0, 0.9),  # is not there
+            (1.25, 30.0, 0.3),  # is not where the network puts it
+            (0.8, 6.0, 0.9),  # of another scale
+        )
+    ]
+    there = [torch.tensor([i != 4]) for i in range(len(ratios))]
+    pooled = pool_gains(ratios, there)
+    assert [float(one.gain) for one in pooled] == [11, 11, 0, 0, 41, 41, 6]
+    assert [bool(one.contradicts()) for one in ratios[:2]] == [False, False]
+    assert [bool(one.contradicts()) for one in pooled[:4]] == [True, True, False, False]
+    assert not pooled[6].contradicts()

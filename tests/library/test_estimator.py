@@ -16,8 +16,10 @@ import torch
 import posefilter
 from posefilter import devices
 from posefilter.cli.command import run_command
+from posefilter.confidence.scale_ratio import ScaleRatio
 from posefilter.images import check_images
 from posefilter.metrics.bop_results import read_poses_csv
+from posefilter.result import collect_results
 
 HOME = Path(__file__).parents[2]
 SCENE = HOME / "docs" / "scenes" / "003_cracker_box" / "mixed" / "scene0000_0"
@@ -206,6 +208,19 @@ def test_a_depth_that_is_a_fourth_too_large_is_measured_and_not_believed(
     (warning,) = large.warnings
     assert "depth_scale" in warning
     assert "intrinsics" in warning
+
+
+def test_objects_of_one_image_are_measured_together(estimator: posefilter.Estimator) -> None:
+    """Of two that appear a fifth too large, and neither certainly, both are doubted."""
+    rgb, depth, K = read_scene(0, ONE_MODE)
+    (run,) = estimator.run(check_images(rgb, depth, K)[0])
+    assert run.size is not None
+    doubtful = run._replace(size=ScaleRatio(*torch.tensor([[1.2], [5.0], [0.9]])))
+    (alone,), together = collect_results([doubtful])[0], collect_results([doubtful, doubtful])[0]
+    assert (alone.verdict, alone.wrong_size) == ("found", False)
+    assert [(one.verdict, one.wrong_size) for one in together] == 2 * [("unsure", True)]
+    right = [one.wrong_size for one in collect_results([doubtful, run])[0]]
+    assert right == [False, False]
 
 
 def test_instances_of_a_wrong_size_are_not_believed(estimator: posefilter.Estimator) -> None:

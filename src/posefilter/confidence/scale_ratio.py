@@ -9,7 +9,7 @@ transform, whose scale is 1 where the inputs are right.
 
 import math
 import weakref
-from collections.abc import MutableMapping
+from collections.abc import MutableMapping, Sequence
 from typing import NamedTuple
 
 import torch
@@ -74,6 +74,28 @@ def measure_scale_ratio(
     size = ScaleRatio(*(torch.stack(part) for part in zip(*found, strict=True)))
     _KNOWN[best] = weakref.ref(coordinates.logit), weakref.ref(cells.valid), size
     return size
+
+
+def pool_gains(ratios: Sequence[ScaleRatio], present: Sequence[Tensor]) -> list[ScaleRatio]:
+    """Return the scale ratios of several objects in the same images, judged together.
+
+    Depth and intrinsics are the same for all objects of an image. So the gain of each object's
+    scale is its own and that of every other object that is there and has the same scale, up to the
+    tolerance of one.
+
+    Args:
+        ratios: One an object, of B images each.
+        present: (B,) bool of each, whether it is there: an object that is not adds to no other.
+
+    Returns:
+        The ratios with these gains.
+    """
+    scale, gain, explained = (torch.stack(part) for part in zip(*ratios, strict=True))  # (O, B)
+    counts = torch.stack([*present]).to(scale.device) & (explained > _EXPLAINED)
+    same = (scale[:, None].log() - scale.log()).abs() < _TOLERANCE  # (O, O, B), not of nan
+    others = ~torch.eye(len(scale), dtype=torch.bool, device=scale.device)[..., None]
+    pooled = gain + (gain * (same & others & counts)).sum(1)
+    return [one._replace(gain=total) for one, total in zip(ratios, pooled, strict=True)]
 
 
 class _Seen(NamedTuple):
