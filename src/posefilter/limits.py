@@ -2,6 +2,7 @@
 
 import io
 import json
+import re
 import struct
 import warnings
 from collections.abc import Callable
@@ -14,8 +15,10 @@ from PIL import Image, UnidentifiedImageError
 from posefilter.errors import BadData, find_reason
 
 MOST_SIDE, MOST_PIXELS = 16_384, 1 << 27  # of an image: a photograph of 100 megapixels passes
+MOST_SCANS = 100  # of a JPEG: encoders write up to 20, and each goes through all of the image
 FEWEST_KNOWN = 0.001  # share of an image's pixels with depth, below which it cannot be judged
 MOST_BYTES = 1 << 29  # of an image's or JSON's file
+_MARKER = re.compile(rb"\xff([^\x00\x01\xd0-\xd8\xff])")  # of a JPEG, that has a length or ends it
 _OTHERS = {  # by what files begin with, that are named for images
     b"\x93NUMPY": "it is an array: end its name in .npy",
     b"PK\x03\x04": "it is an archive, as .npz is: save the array by np.save",
@@ -159,8 +162,8 @@ PlainLoader.add_constructor("tag:yaml.org,2002:opencv-matrix", PlainLoader.const
 def check_picture(path: Path, data: bytes) -> int:
     """Return the number of an image's pixels.
 
-    Raises BadData where its header promises more than photographs have: decoding would fill the
-    memory.
+    Raises BadData where its header promises more than photographs have, or a JPEG has more scans:
+    decoding would fill the memory, or not end.
     """
     try:
         with warnings.catch_warnings():
@@ -178,4 +181,18 @@ def check_picture(path: Path, data: bytes) -> int:
         raise BadData(
             path, "image too large", f"{width}x{height} pixels, at most {MOST_SIDE} a side"
         )
+    if data.startswith(b"\xff\xd8") and _has_many_scans(data):
+        raise BadData(path, "image too large", f"a JPEG of more than {MOST_SCANS} scans")
     return int(width * height)
+
+
+def _has_many_scans(data: bytes) -> bool:
+    """Tell whether a JPEG, up to its end, has more scans than images need."""
+    at, scans = 2, 0
+    while (found := _MARKER.search(data, at)) and found[1] != b"\xd9":
+        scans += found[1] == b"\xda"
+        if scans > MOST_SCANS:
+            return True
+        # a segment says its length; behind that of a scan come its data, which have no marker
+        at = found.end() + max(int.from_bytes(data[found.end() : found.end() + 2], "big"), 2)
+    return False

@@ -22,7 +22,7 @@ _CALLED = re.compile(
     r"|collections (OrderedDict|Counter)|(__builtin__|builtins) set"
 )
 _NAMED = re.compile(
-    r"torch \w+Storage|torch\.storage (Typed|Untyped)Storage|torch (\w*float\w*|\w*int\d+|bool)"
+    r"torch (?!Q)\w+Storage|torch\.storage (Typed|Untyped)Storage|torch (\w*float\w*|u?int\d+|bool)"
 )
 _LEAVES = (
     *("NONE", "NEWTRUE", "NEWFALSE", "BININT", "BININT1", "BININT2", "BINFLOAT", "BINUNICODE"),

@@ -183,6 +183,18 @@ CONTENTS: dict[str, Callable[[dict[str, Any]], Any]] = {
         x=torch.sparse_coo_tensor(torch.zeros(1, 1).long(), [1.0], (1 << 40,))
     ),
     "no storage": lambda c: c["state_dict"].update(x=torch.empty(1 << 40, device="meta")),
+    "8-bit floats": lambda c: c["object_model"].update(
+        points=torch.zeros(5, 3).to(torch.float8_e4m3fn)
+    ),
+    "pairs of 4-bit floats": lambda c: c["state_dict"].update(
+        x=torch.zeros(4, dtype=torch.uint8).view(torch.float4_e2m1fn_x2)
+    ),
+    "no elements of a large shape": lambda c: c["state_dict"].update(x=torch.empty(0, 1 << 60)),
+    "a weight's name of two lines": lambda c: c["state_dict"].update({"a\nb": torch.zeros(1)}),
+    "a weight's name that a terminal obeys": lambda c: c["state_dict"].update(
+        {"a\x1b[2J": torch.zeros(1)}
+    ),
+    "a weight's name of 10 MB": lambda c: c["state_dict"].update({"a" * 10**7: torch.zeros(1)}),
     "no tensor": lambda c: c["state_dict"].update(x=[1]),
     "many values": lambda c: c.update(loops=laughs()),
     "a path for a name": lambda c: c["object_model"].update(name="../../secret"),
@@ -225,6 +237,8 @@ def test_hostile_contents_are_refused(
     with watch, pytest.raises(UserError, match="checkpoint") as told:
         method_of(read_checkpoint(path))
     assert "\n" not in str(told.value)
+    assert str(told.value).isprintable()
+    assert len(str(told.value)) < 1000
 
 
 def test_a_storage_is_as_large_as_its_part(content: dict[str, Any], save: Save, watch: Any) -> None:

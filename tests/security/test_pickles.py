@@ -46,6 +46,8 @@ HOSTILE = {
     "a list within two tuples": (Call(Counter, ((MANY * 6,),)), "is given"),
     "a storage of its own": (Call(torch.UntypedStorage, (1 << 36,)), "it calls 'torch.storage"),
     "a type of numbers, called": (Call(torch.float32, (1,)), "it calls 'torch float32'"),
+    "a quantized storage": (None, "it names 'torch QUInt8"),
+    "a quantized type": (None, "it names 'torch quint8"),
     "items that are a text": (Shadowed({"items": "abc"}, {"a": 1}), "attributes of its own"),
     "items that are hidden": (Shadowed({"items": set}, {"a": 1}), "attributes of its own"),
     "attributes that are no dict": (Call(OrderedDict, (), [1]), "attributes of its own"),
@@ -57,6 +59,10 @@ def test_it_is_refused_before_it_is_obeyed(what: str) -> None:
     value, expected = HOSTILE[what]
     if what == "a type of numbers, called":  # Python refuses to write it
         data = b"\x80\x02ctorch\nfloat32\nK\x01\x85R."
+    elif what == "a quantized storage":
+        data = b"\x80\x02ctorch\nQUInt8Storage\n."
+    elif what == "a quantized type":
+        data = b"\x80\x02ctorch\nquint8\n."
     else:
         data = pickle.dumps({"x": value}, 2)
     with pytest.raises(UserError, match=expected):

@@ -89,6 +89,83 @@ def test_a_method_larger_than_its_weights_is_not_allocated(
         method_of(read_checkpoint(path))
 
 
+NUMBERS: dict[str, tuple[Callable[[dict[str, Any]], Any], str]] = {
+    "a million steps": (lambda s: s["filter"].update(steps=1_000_000), "filter.steps=1000000"),
+    "a million steps, by reference": (
+        lambda s: (s.update(variant=1_000_000), s["filter"].update(steps="${variant}")),
+        "variant=1000000",
+    ),
+    "a million steps in training": (
+        lambda s: s["model"]["train_rollout"].update(steps=1_000_000),
+        "model.train_rollout.steps=1000000",
+    ),
+    "widths below zero": (lambda s: s["model"]["encoder"].update(widths=[-1] * 4), "widths="),
+    "a spacing beyond all images": (
+        lambda s: s["model"]["glimpse"].update(spacing=1e30),
+        "model.glimpse.spacing=1e\\+30",
+    ),
+    "a loss that is none": (
+        lambda s: s["model"]["aux_losses"].update(sides=[]),
+        "describes no method",
+    ),
+}
+
+
+@pytest.mark.parametrize("what", NUMBERS)
+def test_what_a_method_is_built_of_is_in_range(
+    what: str, content: dict[str, Any], save: Save, watch: Any
+) -> None:
+    """A step more than any search needs would have a prediction go on for hours."""
+    change, said = NUMBERS[what]
+    change(content["recipe"]["settings"])
+    path = save(content)
+    with watch, pytest.raises(UserError, match=said) as refusal:
+        method_of(read_checkpoint(path))
+    assert "\n" not in str(refusal.value)
+
+
+SPECIAL: dict[str, Any] = {
+    "_args_": [1],
+    "args": [1],
+    **dict.fromkeys(("_recursive_", "_convert_", "self", "__class__", "__init__"), "object"),
+    "_partial_": True,
+    "_target_": ["posefilter.models.cnn_patch.CnnPatch"],
+}
+UNREACHED = (  # by attributes of what may be built, or in letters that Python takes for others
+    "posefilter.losses.likelihood.Bce.__init__.__globals__",
+    "posefilter.losses.likelihood.Bce.__class__",
+    "posefilter.losses.likelihood.Bce.load_state_dict",
+    "posefilter.losses.likelihood.Bce.forward.__code__",
+    "posefilter.losses.likelihood.\uff22ce",
+    "posefilter.losses.likelihood..Bce",
+    "posefilter.losses.likelihood.Bce\u00a0",
+)
+
+
+@pytest.mark.parametrize("key", SPECIAL)
+def test_a_node_has_no_special_arguments(
+    key: str, content: dict[str, Any], save: Save, watch: Any
+) -> None:
+    content["recipe"]["settings"]["model"][key] = SPECIAL[key]
+    path = save(content)
+    with watch, pytest.raises(UserError) as refusal:
+        method_of(read_checkpoint(path))
+    assert "\n" not in str(refusal.value)
+
+
+@pytest.mark.parametrize("name", UNREACHED)
+def test_no_attribute_is_reached(
+    name: str, content: dict[str, Any], save: Save, watch: Any
+) -> None:
+    settings = content["recipe"]["settings"]
+    settings["variant"] = name
+    settings["model"]["loss"] = {"_target_": "${variant}"}
+    path = save(content)
+    with watch, pytest.raises(UserError) as refusal:
+        method_of(read_checkpoint(path))
+    assert "\n" not in str(refusal.value)
+
+
 def test_the_good_checkpoint_is_read(good: Path, watch: Any) -> None:
     with watch:
         method = method_of(read_checkpoint(good))

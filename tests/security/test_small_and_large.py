@@ -27,6 +27,7 @@ from posefilter.cli.checkpoints import method_of, read_checkpoint
 from posefilter.cli.resume import overrides_of
 from posefilter.data.generated_scenes import ensure_scenes
 from posefilter.data.points import read_model_points
+from posefilter.data.readers.decode import read_color, read_size
 from posefilter.data.readers.ycb_video_files import read_meta
 from posefilter.errors import UserError
 from posefilter.meshes import obj
@@ -419,6 +420,23 @@ def test_a_mesh_that_grows_is_refused(
     path = pictures / "x.obj"
     path.write_text(text)
     assert told in refuse(lambda: read_mesh(path, "x"))
+
+
+def scans(count: int, read: Callable[[Path], Any], path: Path) -> Any:
+    """Read a JPEG that repeats its last scan."""
+    image, options = np.zeros((512, 512, 3), np.uint8), [cv2.IMWRITE_JPEG_PROGRESSIVE, 1]
+    data = cv2.imencode(".jpg", image, options)[1].tobytes()
+    path.write_bytes(data[:-2] + data[data.rindex(b"\xff\xda") : -2] * count + b"\xff\xd9")
+    return read(path)
+
+
+@pytest.mark.parametrize("read", [read_color, read_size, lambda path: obj.read_image(path, path)])
+def test_a_jpeg_without_an_end_of_scans_is_not_decoded(
+    read: Callable[[Path], Any], tmp_path: Path
+) -> None:
+    """Each goes through the whole image: 1 MB of them through 64 megapixels for ten minutes."""
+    assert "more than 100 scans" in refuse(lambda: scans(20_000, read, tmp_path / "x.jpg"))
+    assert scans(50, read, tmp_path / "x.jpg") is not None
 
 
 AXES = [{"axis": [0, 0, 1], "offset": [x, 0, 0]} for x in (0, 1, 2, 3)]

@@ -24,6 +24,7 @@ _MOST_FILES = 50_000  # in an archive
 # of what is in it: optimizers and loops hold a few values a parameter
 _MOST_NODES, _DEEPEST = 500_000, 64
 _PART = re.compile(r"[\w.\-]{1,100}(/[\w.\-]{1,100}){0,4}")
+_LONGEST = 500  # name of a weight
 _POINTS = 1_000_000  # of an object's surface
 _MOST = {"symmetries": 10_000, "texture": 20_000, "shape_symmetries": 1_000}  # rows
 _PARTS = 100
@@ -100,7 +101,8 @@ def check_content(checkpoint: Any, file: Path) -> dict[str, Any]:
             check_tensor(value, size)
     state = checkpoint["state_dict"]
     if not isinstance(state, dict) or not all(
-        isinstance(k, str) and isinstance(v, Tensor) for k, v in state.items()
+        isinstance(k, str) and k.isprintable() and len(k) <= _LONGEST and isinstance(v, Tensor)
+        for k, v in state.items()
     ):
         raise UserError("its state_dict should hold tensors by name")
     if sum(value.numel() * value.element_size() for value in state.values()) > _SPREAD * size:

@@ -23,6 +23,7 @@ from posefilter.errors import UserError, find_reason, naming
 from posefilter.filters.loop import MAX_SEARCHES
 from posefilter.models.base import PoseEstimator, with_lightning
 from posefilter.models.quantization import unpack, unpack_object
+from posefilter.ranges import check_ranges
 from posefilter.types import ObjectModel
 from posefilter.weights import expand_weights, find_weights
 
@@ -57,6 +58,7 @@ def build_method(
     check_fit(settings, recipe["choices"], Scope.RECIPE)
     variant = _with_lightning if lightning else None
     try:
+        check_ranges({"model": resolve(settings.get("model"))}, "train")
         method = instantiate_recipe(settings.get("model"), "model", variant)
     except UserError as error:
         where, found, rest = str(error).partition(":")
@@ -144,8 +146,14 @@ def method_of(
     recipe = {**recipe, "settings": without_pretrained(settings)}
     state = unpack(checkpoint["state_dict"])
     elements = 4 * sum(value.numel() for value in state.values()) + _SPARE_ELEMENTS
-    with Bounded(elements, 20 * len(state) + _SPARE_TENSORS):
-        method = build_method(recipe, unpack_object(checkpoint["object_model"]), lightning)
+    try:
+        with Bounded(elements, 20 * len(state) + _SPARE_TENSORS):
+            method = build_method(recipe, unpack_object(checkpoint["object_model"]), lightning)
+    except UserError:
+        raise
+    except Exception as error:  # settings that do not fit each other break in any component
+        why = f"{type(error).__name__}: {find_reason(error)[:200]}"
+        raise UserError(f"checkpoint: its recipe describes no method ({why})") from error
     try:
         missing, foreign = method.load_state_dict(state, strict=False)
     except RuntimeError as error:  # tensors of other shapes
