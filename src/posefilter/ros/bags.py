@@ -24,6 +24,7 @@ from posefilter.ros.messages import (
     rectify,
     stamp_of,
 )
+from posefilter.ros.untrusted import check_bag
 
 _NAME = re.compile(r"(/[A-Za-z_][A-Za-z0-9_]*)+")  # of a topic, with its namespace
 _MCAP, _ROS1 = b"\x89MCAP0\r\n", b"#ROSBAG V"  # that files begin with; the former ends with it, too
@@ -86,8 +87,11 @@ class BagReader:
         self._nearest: int | None = None  # [ns] between color and depth that are not of one moment
         self._by_recording = False  # whether headers have no time
         try:
+            check_bag(path)
             self.reader = Reader(path)
             self.reader.open()
+        except UserError as error:
+            raise UserError(f"bag={error}") from error
         except Exception as error:  # a damaged header decides what breaks, memory included
             reason = _find_remedy(path) or find_reason(error)[:200]
             raise UserError(f"bag={path}: cannot be read as a ROS 2 bag ({reason})") from error
