@@ -17,8 +17,9 @@ def find_conf() -> Path:
 
 def is_plain_name(name: str) -> bool:
     """Tell whether a name is one part of a path and nothing else: no separator, no leading dot,
-    only what can be printed, also where letters that mean the same are made one; a file of that
-    name, with a suffix, can be made.
+    nothing that a spreadsheet takes for a formula or a command for an option, only what can be
+    printed, also where letters that mean the same are made one; a file of that name, with a suffix,
+    can be made.
     """
     same = unicodedata.normalize("NFKC", name)
     return (
@@ -26,7 +27,7 @@ def is_plain_name(name: str) -> bool:
         and name.isprintable()
         and len(name.encode()) <= 200
         and name == name.strip()
-        and not same.startswith((".", "~"))
+        and not same.startswith((".", "~", "=", "+", "-", "@"))
         and not set(same) & set("/\\:")
     )
 
