@@ -366,16 +366,14 @@ def pool_scale_ratios(runs: Sequence[Run]) -> list[Run]:
     """
     out = list(runs)
     known = [
-        (i, run.size, run.found.presence)
+        (i, ScaleRatio(*(part.cpu() for part in run.size)), run.found.presence.cpu() > _THERE)
         for i, run in enumerate(runs)
         if run.size is not None and run.found is not None
     ]
     if len(known) > 1:
-        numbers, sizes, presences = zip(*known, strict=True)
-        sizes = [ScaleRatio(*(part.cpu() for part in size)) for size in sizes]
-        there = [presence.cpu() > _THERE for presence in presences]
-        for i, size in zip(numbers, pool_gains(sizes, there), strict=True):
-            out[i] = out[i]._replace(size=size)
+        numbers, ratios, there = zip(*known, strict=True)
+        for i, ratio in zip(numbers, pool_gains(ratios, there), strict=True):
+            out[i] = out[i]._replace(size=ratio)
     return out
 
 
