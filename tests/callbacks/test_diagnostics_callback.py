@@ -101,7 +101,7 @@ def test_methods_on_poses_are_left_alone(tmp_path: Path) -> None:
     assert has_pixel_particles(run)
     assert not has_pixel_particles(poses)
     callback = Diagnostics(tmp_path)
-    trainer = SimpleNamespace(loggers=[], global_step=0, sanity_checking=False)
+    trainer = SimpleNamespace(loggers=[], global_step=0, sanity_checking=False, is_global_zero=True)
     callback.on_test_batch_end(trainer, None, poses, scenes(2), 0)  # type: ignore[arg-type]
     callback.on_validation_epoch_end(trainer, SimpleNamespace(scores={}))  # type: ignore[arg-type]
     assert not list(tmp_path.iterdir())

@@ -1,7 +1,9 @@
 """On a full disk whatever is written ends in one line, and nothing half is left under its name."""
 
 import ctypes
+import errno
 import os
+import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -10,11 +12,14 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from torch.utils.tensorboard import SummaryWriter
 
 from posefilter.belief import Belief
 from posefilter.callbacks.records import write_beliefs
 from posefilter.checking.contact_figure import write_sheet
 from posefilter.cli import run_command
+from posefilter.cli.console import JSON, settle_logging
+from posefilter.cli.explain import explain
 from posefilter.cli.files import save_whole
 from posefilter.cli.results import write_json
 from posefilter.data.cache import DiskCache
@@ -142,3 +147,36 @@ def test_a_folder_on_a_disk_that_may_only_be_read_is_one_line(
     (line,) = capfd.readouterr().err.splitlines()
     assert line.startswith(f"{command}: {tmp_path}")
     assert line.endswith("(Read-only file system)")
+
+
+def test_a_full_disk_under_tensorboard_is_raised_and_not_printed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """Its thread writes events, and hands what it failed by to the next one that is written."""
+    full = OSError(errno.ENOSPC, "No space left on device")
+
+    def refuse(*_: object) -> None:
+        raise full
+
+    monkeypatch.setattr(threading, "excepthook", threading.excepthook)
+    settle_logging(JSON)
+    board = SummaryWriter(str(tmp_path))
+    writer = board._get_file_writer().event_writer._async_writer._worker
+    monkeypatch.setattr(writer._record_writer, "write", refuse)
+    board.add_scalar("loss", 1.0, 0)
+    writer.join(timeout=30)
+    with pytest.raises(OSError, match="No space left"):
+        board.flush()
+    assert "Traceback" not in capfd.readouterr().err
+    assert explain(full, "train", tmp_path, []).startswith("the disk is full")
+
+
+def test_what_another_thread_fails_by_is_printed(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(threading, "excepthook", threading.excepthook)
+    settle_logging(JSON)
+    failing = threading.Thread(target=lambda: (_ for _ in ()).throw(OSError("lost")).__next__())
+    failing.start()
+    failing.join()
+    assert "lost" in capsys.readouterr().err

@@ -228,30 +228,34 @@ def test_initial_particles_of_a_training_filter_are_named_by_their_key(tmp_path:
 
 
 NUMBERS = {
-    "model=patch_pf model.glimpse.size=-1": ["model.glimpse.size=-1", "1 pixel or more"],
-    "model=cnn_patch model.glimpse.size=0": ["model.glimpse.size=0", "1 pixel or more"],
+    "model=patch_pf model.glimpse.size=-1": ["model.glimpse.size=-1", "at least 1,"],
+    "model=cnn_patch model.glimpse.size=0": ["model.glimpse.size=0", "at least 1,"],
     "model=pixel_pf model/glimpse=integer model.glimpse.size=0": [
         "model.glimpse.size=0",
-        "1 pixel or more",
+        "at least 1,",
     ],
     "model=patch_pf model.glimpse.spacing=0": ["model.glimpse.spacing=0", "above 0"],
-    "model=patch_pf filter.estimate.top_fragments=0": ["estimate", "top_fragments=0", "1 or more"],
-    "model=patch_pf filter.estimate.hypotheses=0": ["estimate", "hypotheses=0", "1 or more"],
+    "model=patch_pf filter.estimate.top_fragments=0": [
+        "estimate",
+        "top_fragments=0",
+        "at least 1,",
+    ],
+    "model=patch_pf filter.estimate.hypotheses=0": ["estimate", "hypotheses=0", "at least 1,"],
     "model=patch_pf filter.estimate.scale_m=0": ["estimate", "scale_m=0", "above 0"],
     "model.candidate_sampler.sigma_levels=1": [
         "model.candidate_sampler",
         "sigma_levels=1",
-        "2 or more",
+        "at least 2,",
     ],
     "model.candidate_sampler.particles=-1": [
         "model.candidate_sampler",
         "particles=-1",
-        "0 for none",
+        "at least 0,",
     ],
     "model=patch_pf model.net.latent_width=0": ["net", "latent_width=0", "1 or more"],
-    "model=patch_pf model.net.layers=0": ["net", "layers=0", "1 or more"],
-    "model=cnn_patch model.net.width=0": ["net", "width=0", "1 or more"],
-    "model=cnn_patch model.net.hidden=-1": ["net", "hidden=-1", "0 or more"],
+    "model=patch_pf model.net.layers=0": ["net", "layers=0", "at least 1,"],
+    "model=cnn_patch model.net.width=0": ["net", "width=0", "at least 1,"],
+    "model=cnn_patch model.net.hidden=-1": ["net", "hidden=-1", "at least 0,"],
 }
 
 

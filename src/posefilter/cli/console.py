@@ -6,6 +6,7 @@ import math
 import re
 import shlex
 import sys
+import threading
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -133,8 +134,10 @@ def settle_logging(console: str) -> None:
     """Have the log's lines on the console be sentences; for machines, on stderr, and only warnings.
     Of several processes, all but the first one say warnings alone.
 
-    Files keep all.
+    Files keep all. What a thread of TensorBoard cannot write (a full disk) is not printed: the next
+    event that is written raises it.
     """
+    threading.excepthook = _report_thread
     for handler in logging.getLogger().handlers:
         if type(handler) is logging.StreamHandler:
             if console == JSON:
@@ -142,6 +145,13 @@ def settle_logging(console: str) -> None:
             if console == JSON or is_follower():
                 handler.setLevel(logging.WARNING)
             handler.setFormatter(logging.Formatter("%(message)s"))
+
+
+def _report_thread(failed: threading.ExceptHookArgs) -> None:
+    """Print what a thread failed by, unless it is raised once more where it can be explained."""
+    written = type(failed.thread).__module__.startswith("tensorboard.")
+    if not (written and isinstance(failed.exc_value, OSError)):
+        threading.__excepthook__(failed)
 
 
 def logging_for(arguments: Sequence[str]) -> list[str]:

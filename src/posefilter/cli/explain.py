@@ -1,6 +1,7 @@
 """From a mistake in a command line to one readable line."""
 
 import difflib
+import errno
 import re
 import shlex
 import traceback
@@ -64,6 +65,8 @@ def explain(error: BaseException, name: str, conf: Path, arguments: list[str]) -
     if isinstance(error, BrokenPipeError):
         return "has ended, since what it prints to was closed (as by `| head`)"
     if isinstance(error, OSError) and error.strerror:
+        if error.filename is None and error.errno == errno.ENOSPC:
+            return f"the disk is full: a file cannot be written ({error.strerror})"
         place = "a file" if error.filename is None else str(error.filename)
         return f"{place}: cannot be read or written ({error.strerror})"
     if isinstance(error, MarkedYAMLError):
