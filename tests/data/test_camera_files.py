@@ -199,6 +199,10 @@ def test_typed_matrices_are_judged_as_those_of_files_are() -> None:
         ({"intrinsics": FOUR, "distortion": [0.1, -0.2, 0, 0, 0]}, "0.1,-0.2,0,0,0"),
         (FOUR | {"p2": 0.01, "k1": 0.1, "k3": 0.2}, "0.1,0,0,0.01,0.2"),
         (FOUR | {"distortion": {"k1": 0.1, "k6": 0.3}}, "0.1,0,0,0,0,0,0,0.3"),
+        (FOUR | {"dist_coeff": [[0.1, -0.2, 0, 0]]}, "0.1,-0.2,0,0"),
+        (FOUR | {"distCoeffs": [[0.1], [-0.2], [0], [0]]}, "0.1,-0.2,0,0"),
+        (FOUR | {"dist": [0.1, -0.2, 0, 0]}, "0.1,-0.2,0,0"),
+        (FOUR | {"Distortion_Coefficients": {"data": [0.1, -0.2, 0, 0]}}, "0.1,-0.2,0,0"),
     ],
 )
 def test_a_distortion_is_found_where_it_is_told(content: Any, told: str, tmp_path: Path) -> None:
@@ -206,6 +210,33 @@ def test_a_distortion_is_found_where_it_is_told(content: Any, told: str, tmp_pat
     path.write_text(json.dumps(content))
     with pytest.raises(UserError, match=f"distortion={told}$"):
         read_intrinsics(str(path))
+
+
+def test_a_distortion_of_another_form_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "matlab.json"
+    lens = {"RadialDistortion": [0.1, -0.2], "TangentialDistortion": [0, 0]}
+    path.write_text(json.dumps(FOUR | lens))
+    with pytest.raises(BadData, match=r"matlab.json: 'RadialDistortion' is a distortion in a form"):
+        read_camera_file(path)
+    path.write_text(json.dumps(FOUR | {"RadialDistortion": [0, 0], "distances": [1, 2]}))
+    assert read_camera_file(path).distortion == ()
+
+
+@pytest.mark.parametrize(
+    "told",
+    [
+        {"resolution": [640, 480]},
+        {"image_size": [480, 640]},
+        {"imageSize": {"width": 640, "height": 480}},
+        {"imageWidth": 640, "imageHeight": 480},
+        {"img_size": [640, 480]},
+    ],
+)
+def test_a_size_is_found_where_it_is_told(told: Any, tmp_path: Path) -> None:
+    """An image of another size has other intrinsics."""
+    path = tmp_path / "camera.json"
+    path.write_text(json.dumps(FOUR | told))
+    assert read_camera_file(path).size == SIZE
 
 
 def test_named_coefficients_of_0_are_no_distortion(tmp_path: Path) -> None:

@@ -1,6 +1,7 @@
 """Read a camera's intrinsics from the files that cameras, calibrations and datasets come with."""
 
-from collections.abc import Mapping
+import re
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -15,13 +16,18 @@ _PAIRS = (("cx", "cy"), ("ppx", "ppy"))  # of the principal point
 _MATRICES = ("camera_matrix", "intrinsic_matrix", "cam_K", "K", "k")
 # that of the color image first: depth is aligned to it
 _INNER = ("intrinsic", "intrinsics", "camera", "color_intrinsics", "depth_intrinsics")
-_DISTORTIONS = ("distortion_coefficients", "coeffs", "dist_coeffs", "distortion", "D", "d")
+# keys of a list of coefficients, as `_plain` has them: everyone abbreviates them otherwise
+_DISTORTION = re.compile(
+    "(lens|camera)?dist(ortion)?(coef[a-z]*|param(eter)?s|vec(tor)?)?|coef[a-z]*|d"
+)
 _NAMES = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")  # of coefficients, in OpenCV's order
 _PROJECTIONS = ("projection_matrix", "P", "p")
 _MODELS = ("distortion_model", "model")  # keys of the kind of distortion
 # kinds that are OpenCV's polynomial, as `distortion=` takes it
 _POLYNOMIALS = ("", "none", "plumb_bob", "rational_polynomial", "brown_conrady", "radtan", "opencv")
-_SIZES = (("width", "height"), ("image_width", "image_height"), ("w", "h"))
+# keys of an image's size, as `_plain` has them
+_SIZES = (("width", "height"), ("imagewidth", "imageheight"), ("imgwidth", "imgheight"), ("w", "h"))
+_BOTH_SIDES = ("imagesize", "imgsize", "resolution", "imageresolution", "size")
 
 
 class CameraFile(NamedTuple):
@@ -94,13 +100,10 @@ def _of_mapping(content: Any, path: Path) -> CameraFile:
 
 def _of_camera(content: Mapping[str, Any], K: np.ndarray, path: Path) -> CameraFile:
     """Return a camera with what a mapping says beside its matrix."""
-    size = None
-    for width, height in _SIZES:
-        if width in content and height in content:
-            size = (whole_number(content, height, path), whole_number(content, width, path))
-            break
-    distortion = _listed(content, _DISTORTIONS)
+    size = _find_image_size(content, K, path)
+    distortion = _listed(content, [key for key in content if _DISTORTION.fullmatch(_plain(key))])
     if distortion is None:
+        _refuse_other_distortion(content, path)
         coefficients = _find_named(content, path)
     else:
         count = np.asarray(distortion["data"], dtype=object).size
@@ -114,6 +117,45 @@ def _of_camera(content: Mapping[str, Any], K: np.ndarray, path: Path) -> CameraF
     return CameraFile(K, size, coefficients, _find_other_model(content), rectified, scale)
 
 
+def _plain(key: Any) -> str:
+    """Return a key in lower case, without what parts its words."""
+    return re.sub("[^a-z0-9]", "", str(key).lower())
+
+
+def _find_image_size(
+    content: Mapping[str, Any], K: np.ndarray, path: Path
+) -> tuple[int, int] | None:
+    """Return height and width of the images [px]; None where a mapping has neither."""
+    keys = {_plain(key): key for key in content}
+    for width, height in _SIZES:
+        if width in keys and height in keys:
+            high, wide = (whole_number(content, keys[side], path) for side in (height, width))
+            return high, wide
+    for name in (name for name in _BOTH_SIDES if name in keys):
+        value = content[keys[name]]
+        if isinstance(value, Mapping):
+            return _find_image_size(value, K, path)
+        if isinstance(value, list) and len(value) == 2:
+            sides = numbers(content, keys[name], path, (2,))
+            # formats differ in the order: the principal point is near the middle in one of them
+            off = [
+                np.abs(K[:2, 2] / np.maximum(one, 1) - 0.5).max() for one in (sides, sides[::-1])
+            ]
+            wide, high = sides if off[0] <= off[1] else sides[::-1]
+            return int(high), int(wide)
+    return None
+
+
+def _refuse_other_distortion(content: Mapping[str, Any], path: Path) -> None:
+    """Raise BadData where a mapping has numbers of a distortion in a form that is not read."""
+    for key, value in content.items():
+        if not (isinstance(value, list) and "distortion" in _plain(key)):
+            continue
+        if np.any(numbers(content, key, path, (np.asarray(value, dtype=object).size,))):
+            advice = "of rectified images type fx,fy,cx,cy, of raw ones distortion=, too"
+            raise BadData(path, f"'{key}' is a distortion in a form that is not read", advice)
+
+
 def _find_scale(content: Mapping[str, Any], path: Path) -> tuple[float, ...]:
     """Return the depth scale of a mapping; () where it has none."""
     if content.get("depth_scale") is None:
@@ -124,7 +166,11 @@ def _find_scale(content: Mapping[str, Any], path: Path) -> tuple[float, ...]:
 
 def _find_named(content: Mapping[str, Any], path: Path) -> tuple[float, ...]:
     """Return the coefficients of a distortion that are given one by one, () where none is."""
-    inner = (content[key] for key in _DISTORTIONS if isinstance(content.get(key), Mapping))
+    inner = (
+        value
+        for key, value in content.items()
+        if _DISTORTION.fullmatch(_plain(key)) and isinstance(value, Mapping)
+    )
     for one in (content, *inner):
         if "k1" in one:
             own = {name: one.get(name, 0.0) for name in _NAMES}
@@ -152,7 +198,7 @@ def _find_matrix(content: Mapping[str, Any], path: Path) -> np.ndarray | None:
     return None if found is None else _orient(numbers(found, "data", path, (3, 3)), path)
 
 
-def _listed(content: Mapping[str, Any], keys: tuple[str, ...]) -> dict[str, Any] | None:
+def _listed(content: Mapping[str, Any], keys: Iterable[str]) -> dict[str, Any] | None:
     """Return a list of numbers by the first of the keys that is there, as {"data": ...}."""
     for key in keys:
         value = content.get(key)
