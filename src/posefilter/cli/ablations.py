@@ -223,7 +223,7 @@ POSE_SPACE_ABLATIONS = (
          "model.quasi_monte_carlo=false"),
         ("pose_pf_m12_refine", "Working, without refinement.", "filter/refine=none"),
         ("pose_pf_m13_icp",
-         "Working, without the alignment with the measured depth (and the turns by the print).",
+         "Working, without the alignment with the measured depth (and the turns by the texture).",
          "filter/refine=mean_shift"),
     ),
 )  # fmt: skip

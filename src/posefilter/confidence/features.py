@@ -25,7 +25,7 @@ from posefilter.types import Batch, BeliefBatch, ObjectModel
 
 _POINTS = 200  # of the surface: as many as exported weights carry
 _NOISE = 0.005  # [m] of the depth
-_FEW = 5  # points of the surface, so that one that is hardly seen is not all print
+_FEW = 5  # points of the surface, so that little visible surface does not count as much texture
 _CELLS = 6  # of the network, that a small object covers
 _NEAREST = 0.01  # [m] points before the camera's plane
 
@@ -122,7 +122,7 @@ def measure_print(
     margin: Tensor | None = None,
     score: Callable[[Tensor], Tensor] | None = None,
 ) -> dict[str, Tensor]:
-    """Return whether the image shows the object's print where poses put it.
+    """Return whether the image shows the object's texture where poses put it.
 
     Args:
         best: (B, 4, 4) camera_from_object [m].
@@ -134,8 +134,8 @@ def measure_print(
 
     Returns:
         (B,) each; nothing where the object has no texture. `texture`: the logarithm of one plus the
-        evidence of the print [nat]. `texture_density`: the same less the logarithm of `surface`,
-        since more of a surface that is seen should show more of its print. `rotation_margin`: how
+        evidence of the texture [nat]. `texture_density`: the same less the logarithm of `surface`,
+        since more of a surface that is seen should show more of its texture. `rotation_margin`: how
         far the estimate's log-posterior is above that of other rotations; absent where the shape
         allows none.
     """

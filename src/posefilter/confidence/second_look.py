@@ -4,12 +4,12 @@ A filter that has converged on a wrong mode does not come back from it: all its 
 and its likelihood prefers it. Other searches may find the right one: of the image without what the
 first answer took for the object, by other random draws, and of the magnified part of the image that
 most likely shows the object, which the network may miss where it is small. Which answer is right is
-then not asked of the likelihood, which has erred, but of a logistic regression on all that speaks
-for an answer: agreement of the particles, measured depth, print, and the network of object
+then not asked of the likelihood, which has erred, but of a logistic regression on the evidence
+for an answer: agreement of the particles, measured depth, texture, and the network of object
 coordinates.
 
 An answer is doubtful, too, where the object appears larger or smaller there than it is: the same
-print in another size, as of a package of the same brand. No answer of that kind replaces another.
+design in another size, as of a package of the same brand. No answer of that kind replaces another.
 """
 
 import math

@@ -35,7 +35,7 @@ class ColorResponse:
     tint: float = 0.12
     gamma: float = 0.2
     gain: tuple[float, float] = (1.0, 1.0)  # range, of all channels, uniform in its logarithm
-    target: str = "image"  # "object": the mask's pixels alone, as faded or retouched print has it
+    target: str = "image"  # "object": the mask's pixels alone, as faded or retouched texture has it
     probability: float = 1.0  # share of samples that are changed
 
     def __post_init__(self) -> None:

@@ -1,6 +1,6 @@
-"""The print as a witness of its own: which turn of a shape fits the colors of the image.
+"""Which rotation of a shape fits the colors of the image, by the texture alone.
 
-A learned likelihood and the depth hardly tell the turns of a can apart, where only print does.
+A learned likelihood and the depth hardly tell the turns of a can apart, where only texture does.
 Here the colors that the mesh has are compared with those that the image shows, without learning.
 """
 
@@ -63,7 +63,7 @@ class Print(NamedTuple):
 def measure_texture(
     poses: Tensor, encoding: HasColor, object_model: ObjectModel, shift: float = _SHIFT
 ) -> Tensor:
-    """Return how much better the object's print explains the image than plain shading does.
+    """Return how much better the object's texture explains the image than plain shading does.
 
     With y the logarithm of the image's colors at the surface points that are seen, and x that of
     the object's, a regression y = shading + gain x is compared with y = shading, where the shading
@@ -76,7 +76,7 @@ def measure_texture(
         encoding: B images with color and depth.
         object_model: The object.
         shift: The best of nine shifts of the image counts, which lie so far apart [focal lengths],
-            since fine print does not correlate where a pose is a millimeter off. 0: none.
+            since fine texture does not correlate where a pose is a millimeter off. 0: none.
 
     Returns:
         Log-likelihood ratios (B, C) [nat], 0 or more.
@@ -279,12 +279,12 @@ def _half_width(sigma: float) -> int:
 
 @dataclass(eq=False)
 class TextureRotations:
-    """Turn the estimate, and the particles, as the print says.
+    """Turn the estimate, and the particles, by the texture.
 
     The turns that move the object's shape onto itself are what the depth leaves open. Each has the
-    log-posterior e + w l, with e the evidence of the print (`measure_texture`) and l the learned
+    log-posterior e + w l, with e the evidence of the texture (`measure_texture`) and l the learned
     log-likelihood. The estimate takes the best of them. Particles draw theirs, so that the belief
-    is spread over turns that the print does not tell apart either. An object whose shape has no
+    is spread over turns that the texture does not distinguish either. An object whose shape has no
     such turn stays as it is.
 
     Args:
@@ -363,7 +363,7 @@ class TextureRotations:
     ) -> tuple[Tensor, Tensor]:
         """Score the turns that are tried first, the most promising at the best turn beside them.
 
-        Fine print does not correlate where a turn is some degrees off, and a can's is up to five
+        Fine texture does not correlate where a turn is some degrees off, and a can's is up to five
         from the nearest that is tried first. The learned score is of the turn tried first: over
         five degrees it hardly changes, and to score the best anew would draw other image points.
 

@@ -45,7 +45,7 @@ class Term(NamedTuple):
 
 
 class TextureAlignment:
-    """Move the estimate so that its print lies on the image's, and its surface on the depth.
+    """Move the estimate so that its texture lies on the image's, and its surface on the depth.
 
     Direct image alignment (Lucas and Kanade 1981): with y the logarithm of the image's colors at
     the surface points that are seen, and x that of the object's own, Gauss-Newton steps over the
@@ -55,8 +55,8 @@ class TextureAlignment:
     estimate before as a Gaussian prior.
 
     Scans have their texture a millimeter or two beside their shape, and otherwise on each side: the
-    print of each of six sides may be shifted, with a Gaussian prior. The estimate is moved only
-    where the print then explains the image clearly better; one of an object without a print stays.
+    texture of each of six sides may be shifted, with a Gaussian prior. The estimate is moved only
+    where the texture then explains the image clearly better; without texture it stays.
     Color and depth should be registered: where they are not, the result follows the colors.
 
     Args:
@@ -66,8 +66,8 @@ class TextureAlignment:
         prior: Standard deviation of the estimate before [m on the object's surface].
         independent: Share of the textured points that count as independent.
         min_correlation: Of the object's colors with the image's; below, they are not used.
-        texture_error: Standard deviation of the shift of a side's print [m].
-        min_gain: By which the evidence of the print must rise for the estimate to be moved [nat],
+        texture_error: Standard deviation of the shift of a side's texture [m].
+        min_gain: By which the evidence of the texture must rise for the estimate to be moved [nat],
             see `measure_texture`.
         gate: Distance along the measured normal beyond which a measured point is not the surface
             point's [m]; in all, it may be 2.5 times as far away.
@@ -244,7 +244,7 @@ def _fit(
 
 
 def _shift_sides(by_twist: Tensor, sides: Tensor, pose: Tensor) -> Tensor:
-    """Return how pixels move with shifts of each side's print, in the object's axes.
+    """Return how pixels move with shifts of each side's texture, in the object's axes.
 
     (n, 2, 6), (n,), (4, 4) -> (n, 2, 3 sides) [px/m].
     """

@@ -167,7 +167,7 @@ def _distances(surface: _Surface, transform: np.ndarray) -> np.ndarray:
 def _color_change(surface: _Surface, transform: np.ndarray) -> np.ndarray:
     """Return by how much colors differ where the samples, moved, come to lie.  -> (P,) in [0, 1].
 
-    Means of 16 neighbors on the same side of the surface: print finer than the sampling is noise.
+    Means of 16 neighbors on the same side of the surface: texture finer than the sampling is noise.
     """
     moved = move(surface.points, transform), surface.normals @ transform[:3, :3].T
     near = surface.nearest_side.query(np.concatenate(moved, axis=1), k=16)[1]

@@ -1,4 +1,4 @@
-"""What a filter carries of an object's print: colored surface points, and the turns that the shape
+"""What a filter carries of an object's texture: colored surface points, and turns that the shape
 leaves open.
 """
 

@@ -239,7 +239,7 @@ def _is_another(digest: str, colors: list[int], record: _Record) -> bool:
 
 
 def summarize_print(mesh: Mesh) -> list[int]:
-    """Return the mean colors of a texture's parts, 8 x 8 of them, in 0 to 255: another print of the
+    """Return the mean colors of a texture's parts, 8 x 8 of them, in 0 to 255: another one of the
     same size shows in them, and another decoder of JPEGs does not.
     """
     few = cv2.resize(mesh.texture, (8, 8), interpolation=cv2.INTER_AREA)
@@ -441,7 +441,7 @@ def _open_dataset(out: Path, job: Job, frames: int, mesh: Mesh | None) -> None:
         else:
             frames = max(frames, len(_list_rendered(out)))
             digest = digest or record.mesh
-            colors = record.colors  # of the print that is there; None of earlier versions
+            colors = record.colors  # of the texture that is there; None of earlier versions
         remove_parts(out, [".", "mixed/*"])
     elif out.is_dir() and any(path.name != LOCK for path in out.iterdir()):
         raise UserError(

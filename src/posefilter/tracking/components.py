@@ -82,9 +82,9 @@ def smooth(predicted: Tensor, measured: Tensor, space: PoseSpace, noise: float) 
 
 
 class RotateTogether:
-    """Turn the estimate as the print says, and all particles by the same turn.
+    """Turn the estimate by the texture, and all particles by the same turn.
 
-    In a single image particles spread over the turns that its print leaves open. In a track the
+    In a single image particles spread over the turns that its texture leaves open. In a track the
     frames before have decided among them, and particles that each frame scattered anew would be
     missing where the object is. Of a can, of whose shape any turn is open, those near the estimate
     are compared alone: the frame before tells the rest.

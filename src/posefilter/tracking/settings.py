@@ -82,8 +82,8 @@ class TrackerSettings:
         fit_pixels: Image points that a pose is scored from in these fits.
         icp_prior: Standard deviation of that estimate, as the prior of ICP with the measured depth
             [m on the object's surface]; 0: no ICP. A method that keeps no depth has none.
-        texture_every: Every so many frames the estimate and the particles are turned as the print
-            says, among the turns that the shape leaves open, where single images are; 0: never. A
+        texture_every: Every so many frames the texture turns the estimate and the particles,
+            among the turns that the shape leaves open, where it does in single images; 0: never. A
             search that finds the object again always ends so.
         jump_penalty: Log odds against a jump to what the network proposes, while the object is
             tracked [nat]; so that it does not flip between faces that look alike.

@@ -405,7 +405,7 @@ class Track:
 
     def _refine(self, quadratic_fits: int, turns: Sequence[Refine] = ()) -> Refine:
         """Return what improves a frame's estimate: the likelihood, then the measured depth, then
-        `turns` by the print.
+        `turns` by the texture.
         """
         parts: list[Refine] = [QuadraticFit(quadratic_fits, pixels=self.settings.fit_pixels)]
         prior = self.settings.icp_prior
