@@ -1,5 +1,6 @@
 """Pictures of beliefs: mass is drawn where the belief is."""
 
+import itertools
 import math
 import re
 from dataclasses import replace
@@ -21,9 +22,9 @@ from posefilter.figures.belief import (
     select_single,
     summarize_belief,
 )
-from posefilter.figures.canvas import halve
-from posefilter.figures.layout import WIDTH
-from posefilter.figures.marginals import compute_marginals
+from posefilter.figures.canvas import halve, load_font
+from posefilter.figures.layout import DETAIL, WIDTH, tile_width
+from posefilter.figures.marginals import choose_few_ticks, compute_marginals
 from posefilter.figures.mollweide import (
     color_by_turn,
     draw_blank_map,
@@ -31,6 +32,7 @@ from posefilter.figures.mollweide import (
     map_to_sphere,
     project_to_map,
 )
+from posefilter.figures.panels import LEFT, RIGHT
 from posefilter.geometry.pose import make_pose, move_about
 from posefilter.geometry.rotation import angle_between, exp_so3
 from posefilter.types import BeliefBatch, ObjectModel
@@ -225,6 +227,23 @@ def test_marginals_are_in_the_units_they_say() -> None:
     width = np.sqrt(np.average(middle(turns[2]) ** 2, weights=turns[2].mass))
     assert width == pytest.approx(math.degrees(0.03), rel=0.2)
     assert shifts[0].edges[0] < min(shifts[0].marks) < max(shifts[0].marks) < shifts[0].edges[-1]
+
+
+@pytest.mark.parametrize("scale", [0.3, 1.0, 3.0, 10.0, 100.0])
+def test_labels_below_a_histogram_do_not_touch(scale: float) -> None:
+    width = tile_width(3) - LEFT - RIGHT
+    rng, several = np.random.default_rng(0), 0
+    for low, high in [(-7.0, 4.5), *zip(-rng.random(99) - 0.01, rng.random(99), strict=True)]:
+        low, high = low * scale, high * scale
+        ticks = choose_few_ticks(low, high, width)
+        assert ticks
+        places = [(tick - low) / (high - low) * (width - 1) for tick in ticks]
+        halves = [load_font(DETAIL).getlength(f"{tick:g}") / 2 for tick in ticks]
+        ends = [(x - half, x + half) for x, half in zip(places, halves, strict=True)]
+        for (_, end), (begin, _) in itertools.pairwise(ends):
+            assert begin - end > 2
+        several += len(ticks) >= 2
+    assert several >= 95
 
 
 def test_what_lies_beyond_a_histogram_is_reported() -> None:

@@ -6,10 +6,10 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
-from posefilter.figures.canvas import Color, arrange_grid
+from posefilter.figures.canvas import Color, arrange_grid, load_font
 from posefilter.figures.curves import choose_ticks
 from posefilter.figures.layout import CAPTION, DETAIL, add_caption, draw_text, tile_width
-from posefilter.figures.panels import Axis, draw_histogram_panel
+from posefilter.figures.panels import LEFT, RIGHT, Axis, draw_histogram_panel
 from posefilter.geometry.pose import origin_of, rotation_of
 from posefilter.geometry.rotation import log_so3
 from posefilter.types import ObjectModel
@@ -19,6 +19,7 @@ ESTIMATE: Color = (214, 33, 156)
 OBJECT_AXES = "xyz"
 CAMERA_AXES = ("right [mm]", "down [mm]", "away [mm]")
 _BINS = 25  # of a histogram
+_GAP = 4  # [px] between labels of an axis, at least
 _ABOUT = tuple(f"about {name} [degrees]" for name in OBJECT_AXES)
 
 
@@ -84,13 +85,32 @@ def draw_marginal(one: Marginal, label: str) -> np.ndarray:
     """Draw one histogram."""
     low, high = float(one.edges[0]), float(one.edges[-1])
     top = 1.1 * max(float(one.mass.max()), 1e-6)
-    x = Axis(label, low, high, choose_ticks(low, high, 3, 3 if max(-low, high) < 100 else 2))
+    x = Axis(label, low, high, choose_few_ticks(low, high, tile_width(3) - LEFT - RIGHT))
     y = Axis("share", 0, top, choose_ticks(0, top, 2))
     marks = list(zip(one.marks, (ESTIMATE, TRUTH), strict=False))[::-1]
     note = f"{one.beyond:.1%} lies beyond" if one.beyond >= 5e-4 else ""
     return add_caption(
         draw_histogram_panel(one.mass, one.edges, marks, x, y, tile_width(3), 160), note, DETAIL
     )
+
+
+def choose_few_ticks(low: float, high: float, width: int) -> tuple[float, ...]:
+    """Return as many ticks as have labels that do not touch each other, three or four at most.
+
+    Args:
+        low: Left end of the axis.
+        high: Its right end.
+        width: Its length [px].
+    """
+    letters, ticks = load_font(DETAIL), tuple[float, ...]()
+    for most, least in ((3, 3), (3, 2), (2, 2), (1, 1)):
+        ticks = choose_ticks(low, high, most, least)
+        places = [(tick - low) / (high - low) * width for tick in ticks]
+        room = np.array([letters.getlength(f"{tick:g}") / 2 for tick in ticks])
+        gaps = np.diff(places) - room[:-1] - room[1:]
+        if ticks and (gaps >= _GAP).all():
+            break
+    return ticks
 
 
 def compute_histogram(values: np.ndarray, weights: np.ndarray, marks: list[float]) -> Marginal:
