@@ -26,6 +26,15 @@ distortion_coefficients: {{rows: 1, cols: 5, data: [0, 0, 0, 0, 0]}}
 projection_matrix: {{rows: 3, cols: 4, data: {np.c_[K, np.zeros(3)].ravel().tolist()}}}
 """
 SIZE = (480, 640)
+KALIBR = f"""
+camera_model: pinhole
+distortion_coeffs: [0.0, 0.0, 0.0, 0.0]
+distortion_model: radtan
+intrinsics: {[float(one) for one in FOUR.values()]}
+resolution: [640, 480]
+"""
+NERF = {"w": 640, "h": 480, "fl_x": K[0, 0], "fl_y": K[1, 1], "cx": K[0, 2], "cy": K[1, 2]}
+NERF |= {"k1": 0.0, "k2": 0.0, "p1": 0.0, "p2": 0.0, "camera_model": "OPENCV", "frames": []}
 
 
 @pytest.mark.parametrize(
@@ -52,6 +61,9 @@ SIZE = (480, 640)
         ("info.yaml", f"height: 480\nwidth: 640\nk: {K.ravel().tolist()}\nd: []\n", SIZE),
         ("echo.yaml", f"height: 480\nwidth: 640\nk: {K.ravel().tolist()}\nd: []\n---\n", SIZE),
         ("calibration.yml", ROS, SIZE),
+        ("kalibr.yaml", "cam0:" + KALIBR.replace("\n", "\n  "), SIZE),
+        ("sensor.yaml", KALIBR.replace("radtan", "radial-tangential"), SIZE),  # EuRoC's
+        ("transforms.json", NERF, SIZE),
         ("matrix.txt", "\n".join(" ".join(map(str, row)) for row in K), None),
         ("matrix.csv", str(K.tolist()), None),
         ("four.txt", "1066.778 1067.487, 312.9869 241.3109\n", None),
@@ -81,6 +93,18 @@ def test_a_camera_is_read_of_any_form(
         ("a.json", json.dumps(FOUR | {"width": 1.5, "height": 1}), "should be a whole number"),
         ("a.yaml", "a: [", "is no YAML"),
         ("a.yaml", "k: 1\n---\nk: 2\n", "is no YAML .it has several documents: keep one"),
+        ("a.yaml", "cam0: {}\ncam1: {}\n", "holds several cameras: cam0, cam1 .keep one"),
+        ("a.yaml", KALIBR.replace("pinhole", "eucm"), "its camera_model is eucm .only pinhole"),
+        ("a.yaml", "intrinsics: [1, [2], 3, 4]", "'intrinsics' is not numbers"),
+        ("a.npz", "PK", "is an archive of arrays"),
+        ("a.xml", "<a>", "is no XML"),
+        ("a.xml", "<a/>", "expected opencv_storage, found a"),
+        ("a.xml", "<opencv_storage><K>1</K></opencv_storage>", "expected fx, fy, cx, cy .*has K"),
+        (
+            "a.xml",
+            '<!DOCTYPE a [<!ENTITY b "b"><!ENTITY c "&b;&b;">]><opencv_storage/>',
+            "has XML's declarations",
+        ),
         ("a.txt", "1 2 3", r"3 words; expected a matrix \(3, 3\), or fx, fy, cx, cy"),
         ("a.txt", "1 2 3 4 5 6 7 8 9", "no camera matrix"),
     ],
@@ -153,7 +177,7 @@ def test_cameras_that_differ_from_image_to_image_are_told(tmp_path: Path) -> Non
         read_camera_file(tmp_path / "scene_camera.json")
 
 
-@pytest.mark.parametrize("name", ["camera.yaml", "old.yml", "camera.json"])
+@pytest.mark.parametrize("name", ["camera.yaml", "old.yml", "camera.json", "camera.xml"])
 def test_what_opencv_writes_is_read(name: str, tmp_path: Path) -> None:
     path = tmp_path / name
     storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_WRITE)
@@ -201,6 +225,7 @@ def test_typed_matrices_are_judged_as_those_of_files_are() -> None:
         (FOUR | {"distortion": {"k1": 0.1, "k6": 0.3}}, "0.1,0,0,0,0,0,0,0.3"),
         (FOUR | {"dist_coeff": [[0.1, -0.2, 0, 0]]}, "0.1,-0.2,0,0"),
         (FOUR | {"distCoeffs": [[0.1], [-0.2], [0], [0]]}, "0.1,-0.2,0,0"),
+        (NERF | {"k1": 0.1, "p2": 0.3}, "0.1,0,0,0.3,0"),
         (FOUR | {"dist": [0.1, -0.2, 0, 0]}, "0.1,-0.2,0,0"),
         (FOUR | {"Distortion_Coefficients": {"data": [0.1, -0.2, 0, 0]}}, "0.1,-0.2,0,0"),
     ],
@@ -253,6 +278,16 @@ def test_coefficients_of_another_model_are_not_advised_as_opencvs(tmp_path: Path
         with pytest.raises(UserError, match=r"tells a distortion \(equidistant\)") as caught:
             read_intrinsics(str(path), distorted)
         assert "distortion=-0.03" not in str(caught.value)
+    (tmp_path / "kalibr.yaml").write_text(
+        KALIBR.replace("0.0, 0.0", "0.1, 0.2", 1).replace("radtan", "equidistant")
+    )
+    with pytest.raises(UserError, match=r"tells a distortion \(equidistant\)"):
+        read_intrinsics(str(tmp_path / "kalibr.yaml"))
+    (tmp_path / "nerf.json").write_text(
+        json.dumps(NERF | {"k1": 0.1, "camera_model": "OPENCV_FISHEYE"})
+    )
+    with pytest.raises(UserError, match=r"tells a distortion \(OPENCV_FISHEYE\)"):
+        read_intrinsics(str(tmp_path / "nerf.json"))
     camera = tmp_path / "realsense.json"
     for model, known in (("brown_conrady", True), ("inverse_brown_conrady", False)):
         own = REALSENSE | {"model": f"distortion.{model}", "coeffs": [0.01, -0.02, 0, 0, 0]}

@@ -1,18 +1,22 @@
 """Read a camera's intrinsics from the files that cameras, calibrations and datasets come with."""
 
 import re
+import xml.etree.ElementTree as ElementTree
 from collections.abc import Iterable, Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from posefilter.data.readers.decode import numbers, read_array, whole_number
-from posefilter.errors import BadData
-from posefilter.limits import read_json, read_lines, read_yaml
+from posefilter.errors import BadData, find_reason
+from posefilter.limits import read_bytes, read_json, read_lines, read_yaml
 
 _LARGEST = 1 << 24  # bytes
-_PAIRS = (("cx", "cy"), ("ppx", "ppy"))  # of the principal point
+# of the focal lengths and the principal point: BOP's, RealSense's, NeRF's
+_SINGLE = (("fx", "fy", "cx", "cy"), ("fx", "fy", "ppx", "ppy"), ("fl_x", "fl_y", "cx", "cy"))
+_FOURS = ("intrinsics", "intrinsic")  # fx, fy, cx, cy in a list: Kalibr's
 _MATRICES = ("camera_matrix", "intrinsic_matrix", "cam_K", "K", "k")
 # that of the color image first: depth is aligned to it
 _INNER = ("intrinsic", "intrinsics", "camera", "color_intrinsics", "depth_intrinsics")
@@ -22,9 +26,12 @@ _DISTORTION = re.compile(
 )
 _NAMES = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")  # of coefficients, in OpenCV's order
 _PROJECTIONS = ("projection_matrix", "P", "p")
-_MODELS = ("distortion_model", "model")  # keys of the kind of distortion
+_MODELS = ("distortion_model", "model", "camera_model")  # keys of the kind of distortion
 # kinds that are OpenCV's polynomial, as `distortion=` takes it
-_POLYNOMIALS = ("", "none", "plumb_bob", "rational_polynomial", "brown_conrady", "radtan", "opencv")
+_POLYNOMIALS = (
+    "", "none", "plumb_bob", "rational_polynomial", "brown_conrady", "radtan",
+    "radial-tangential", "opencv", "pinhole",
+)  # fmt: skip
 # keys of an image's size, as `_plain` has them
 _SIZES = (("width", "height"), ("imagewidth", "imageheight"), ("imgwidth", "imgheight"), ("w", "h"))
 _BOTH_SIDES = ("imagesize", "imgsize", "resolution", "imageresolution", "size")
@@ -43,12 +50,14 @@ class CameraFile(NamedTuple):
 
 
 def read_camera_file(path: Path) -> CameraFile:
-    """Read JSON, YAML, or a text or `.npy` of a matrix (3, 3) or of fx, fy, cx, cy; of a text,
+    """Read JSON, YAML, XML, or a text or `.npy` of a matrix (3, 3) or of fx, fy, cx, cy; of a text,
     lines that begin with # are none of it.
 
     Known are fx, fy, cx, cy by name (BOP's `camera.json`, RealSense with ppx, ppy), a matrix of
     nine numbers, by rows or by columns (Open3D), ROS's camera_info and its calibration files,
-    OpenCV's FileStorage, and BOP's `scene_camera.json` where all images have one camera.
+    OpenCV's FileStorage (YAML, JSON, XML), Kalibr's and EuRoC's YAML of one pinhole camera, NeRF's
+    `transforms.json` with fl_x, fl_y, cx, cy, and BOP's `scene_camera.json` where all images have
+    one camera.
 
     Raises:
         BadData: The file is missing, of none of these forms, or no camera's.
@@ -58,6 +67,10 @@ def read_camera_file(path: Path) -> CameraFile:
         return _of_mapping(read_yaml(path, _LARGEST), path)
     if ending == ".json":
         return _of_mapping(read_json(path, _LARGEST), path)
+    if ending == ".xml":
+        return _of_mapping(_read_xml(path), path)
+    if ending == ".npz":
+        raise BadData(path, "is an archive of arrays", "save the camera matrix alone, as .npy")
     words: Any
     if ending == ".npy":
         words = read_array(path).ravel()
@@ -66,12 +79,38 @@ def read_camera_file(path: Path) -> CameraFile:
         words = " ".join(lines).translate(str.maketrans(",;[]()", "      ")).split()
     found = {"numbers": words}
     if len(words) == 4:
-        fx, fy, cx, cy = numbers(found, "numbers", path, (4,)).tolist()
-        return CameraFile(_matrix(fx, fy, cx, cy, path))
+        return CameraFile(_matrix(numbers(found, "numbers", path, (4,)).tolist(), path))
     if len(words) == 9:
         return CameraFile(_orient(numbers(found, "numbers", path, (3, 3)), path))
     expected = "a matrix (3, 3), or fx, fy, cx, cy"
     raise BadData(path, "holds no camera", f"{len(words)} words; expected {expected}")
+
+
+def _read_xml(path: Path) -> dict[str, Any]:
+    """Return what OpenCV's FileStorage has written as XML, as its YAML would be read."""
+    data = read_bytes(path, _LARGEST)
+    if b"<!" in data.replace(b"<!--", b""):  # entities multiply, and name other files
+        raise BadData(path, "has XML's declarations (<!...>), which no camera file needs")
+    try:
+        root = ElementTree.fromstring(data)
+    except (ElementTree.ParseError, ValueError, LookupError) as error:
+        raise BadData(path, "is no XML", find_reason(error)) from error
+    if root.tag != "opencv_storage":
+        raise BadData(path, "holds no camera", f"expected opencv_storage, found {root.tag[:40]}")
+    content = dict[str, Any]()
+    for one in root:
+        words = (one.findtext("data") or "").split()
+        text = (one.text or "").strip()
+        content[one.tag] = {"data": [_number(x) for x in words]} if words else _number(text)
+    return content
+
+
+def _number(word: str) -> float | int | str:
+    """Return a word as the number that it is, or as it is."""
+    for kind in (int, float):
+        with suppress(ValueError):
+            return kind(word)
+    return word
 
 
 def _of_mapping(content: Any, path: Path) -> CameraFile:
@@ -82,7 +121,11 @@ def _of_mapping(content: Any, path: Path) -> CameraFile:
         content = {"K": content}
     if not isinstance(content, Mapping):
         raise BadData(path, "holds no camera", "expected fx, fy, cx, cy or a matrix by name")
-    inner = (content[key] for key in _INNER if isinstance(content.get(key), Mapping))
+    kalibr = [key for key in content if re.fullmatch(r"cam\d+", str(key))]
+    if len(kalibr) > 1:
+        raise BadData(path, f"holds several cameras: {', '.join(kalibr)}", "keep one of them")
+    names = (*kalibr, *_INNER)
+    inner = (content[key] for key in names if isinstance(content.get(key), Mapping))
     for one in (content, *inner):
         K = _find_matrix(one, path)
         if K is not None:  # size and distortion may be beside the inner mapping
@@ -190,10 +233,16 @@ def _find_other_model(content: Mapping[str, Any]) -> str:
 
 def _find_matrix(content: Mapping[str, Any], path: Path) -> np.ndarray | None:
     """Return the camera matrix (3, 3) of a mapping; None where it has none."""
-    for x, y in _PAIRS:
-        if all(key in content for key in ("fx", "fy", x, y)):
-            fx, fy, cx, cy = (float(numbers(content, key, path, ())) for key in ("fx", "fy", x, y))
-            return _matrix(fx, fy, cx, cy, path)
+    for keys in _SINGLE:
+        if all(key in content for key in keys):
+            four = [float(numbers(content, key, path, ())) for key in keys]
+            return _matrix(four, path)
+    for key in _FOURS:
+        if isinstance(content.get(key), list) and len(content[key]) == 4:
+            model = str(content.get("camera_model", "pinhole")).lower()
+            if model != "pinhole":
+                raise BadData(path, f"its camera_model is {model[:40]}", "only pinhole is read")
+            return _matrix(numbers(content, key, path, (4,)).tolist(), path)
     found = _listed(content, _MATRICES)
     return None if found is None else _orient(numbers(found, "data", path, (3, 3)), path)
 
@@ -208,7 +257,8 @@ def _listed(content: Mapping[str, Any], keys: Iterable[str]) -> dict[str, Any] |
     return None
 
 
-def _matrix(fx: float, fy: float, cx: float, cy: float, path: Path) -> np.ndarray:
+def _matrix(four: list[float], path: Path) -> np.ndarray:
+    fx, fy, cx, cy = four
     return _orient(np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]]), path)
 
 
