@@ -151,7 +151,14 @@ def test_a_picture_that_says_it_is_turned_is_read_as_it_is_stored(tmp_path: Path
 
 @pytest.mark.parametrize(
     "material",
-    ["Kd 2 -1 0\n", "map_Kd -clamp on -bm 1.0 -s 1 1 1 my\\p 1.png\n", "map_Kd -o 0 0 0 p.png\n"],
+    [
+        "Kd 2 -1 0\n",
+        "map_Ka p.png\nKd 2 -1 0\n",
+        "map_Kd -clamp on -bm 1.0 -s 1 1 1 my\\p 1.png\n",
+        "map_Kd -o 0 0 0 p.png\n",
+        "map_Ka missing.png\nmap_Kd p.png\n",
+        "map_Ka p.png\nKd 0.8 0.8 0.8\n",
+    ],
 )
 def test_materials_of_other_exporters_are_read(material: str, tmp_path: Path) -> None:
     (tmp_path / "my").mkdir()
@@ -163,7 +170,7 @@ def test_materials_of_other_exporters_are_read(material: str, tmp_path: Path) ->
     path = tmp_path / "a.obj"
     path.write_bytes(text.replace("\n", "\r\n").encode())
     mesh = read_mesh(path, "a")
-    if material.startswith("Kd"):
+    if "Kd 2" in material:
         assert mesh.texture.tolist() == [[[255, 0, 0]]]
     else:
         np.testing.assert_array_equal(mesh.texture, picture)

@@ -72,12 +72,16 @@ def _read_mtl(path: Path, source: Path, images: dict[Path, np.ndarray]) -> dict[
     if not path.is_file():
         raise UserError(f"{path}: missing material file, named by {source.name}")
     materials: dict[str, Material] = {}
+    pictures: dict[str, str] = {}  # the file of each material
+    ambient: dict[str, str] = {}
     name = ""
     for key, rest in _read_lines(path):
         key = key.lower()  # exporters write map_kd, too
         if key == "newmtl":
             name = rest
             materials[name] = PLAIN
+            pictures.pop(name, None)
+            ambient.pop(name, None)
         elif key == "kd" and name:
             color = [float(x) for x in rest.split()[:3]]
             color = color * 3 if len(color) == 1 else color  # one number is a gray
@@ -86,15 +90,21 @@ def _read_mtl(path: Path, source: Path, images: dict[Path, np.ndarray]) -> dict[
             color = np.clip(color, 0, 1).tolist()
             materials[name] = materials[name]._replace(color=np.array(color))
         elif key == "map_kd" and name:
-            image = path.parent / _skip_options(rest, path).replace("\\", "/")
-            if image not in images:
-                images[image] = read_image(image, path)
-                pixels = sum(one.shape[0] * one.shape[1] for one in images.values())
-                if pixels > MOST_TEXELS:
-                    raise UserError(
-                        f"{path}: too large: textures of {pixels:,} pixels; scale them down"
-                    )
-            materials[name] = materials[name]._replace(image=images[image])
+            pictures[name] = rest
+        elif key == "map_ka" and name:
+            ambient[name] = rest
+    # some exporters write no other picture, and viewers show it; a color that is chosen stays
+    gray = {name: rest for name, rest in ambient.items() if np.ptp(materials[name].color) == 0}
+    for name, rest in (gray | pictures).items():
+        image = path.parent / _skip_options(rest, path).replace("\\", "/")
+        if image not in images:
+            images[image] = read_image(image, path)
+            pixels = sum(one.shape[0] * one.shape[1] for one in images.values())
+            if pixels > MOST_TEXELS:
+                raise UserError(
+                    f"{path}: too large: textures of {pixels:,} pixels; scale them down"
+                )
+        materials[name] = materials[name]._replace(image=images[image])
     # A picture is shown as it is: exporters leave Kd at any gray beside it.
     return {k: m if m.image is None else m._replace(color=np.ones(3)) for k, m in materials.items()}
 
