@@ -180,6 +180,7 @@ RANGES: dict[str, Range] = {
     "every_n_validations": COUNT,
     "save_top_k": _whole(-1, 1000),
     "budget.seconds": Range(0, 1e9, above=True),
+    "budget.fewest": _whole(0, 10**6),
     "last.minutes": Range(0, 1e6),
     # optimizer, scheduler
     **dict.fromkeys(("lr", "adam_lr", "weight_decay"), Range(0, 10)),

@@ -47,7 +47,8 @@ def find_weights(weights: str | Path | None, setting: str = "checkpoint") -> Pat
         raise UserError(f"{setting}={weights}: must be a file, a run's folder or a name")
     # that of Path raises where there is no such user
     path, name = Path(os.path.expanduser(weights)), str(weights)  # noqa: PTH111
-    if path.exists():
+    shipped = list_shipped()
+    if path.exists() and not (name in shipped and _is_another_folder(path)):
         return path
     if is_several(name) and name != ALL:  # a pattern of one file
         one, *others = expand_weights(name, setting)
@@ -57,7 +58,6 @@ def find_weights(weights: str | Path | None, setting: str = "checkpoint") -> Pat
                 f"{', ...' if len(others) > 1 else ''}); here it must be one"
             )
         return Path(one)
-    shipped = list_shipped()
     if name in shipped:
         return shipped[name]
     url = os.environ.get(URL, "")
@@ -74,6 +74,13 @@ def find_weights(weights: str | Path | None, setting: str = "checkpoint") -> Pat
     )
 
 
+def _is_another_folder(path: Path) -> bool:
+    """Tell whether a path is a folder and no run's: images or results of an object may lie in one
+    that has the name of its weights.
+    """
+    return path.is_dir() and not (path / "checkpoints").exists()
+
+
 def list_shipped() -> dict[str, Path]:
     """Return the weights that ship, by name."""
     files = [file for folder in FOLDERS for file in folder.glob("*.ckpt")]
@@ -84,7 +91,9 @@ def is_several(weights: object) -> bool:
     """Tell whether a setting stands for a list of checkpoints: a sequence, `all`, or a pattern."""
     if isinstance(weights, str | Path):
         name = str(weights)
-        return not Path(name).exists() and (name == ALL or any(sign in name for sign in "*?["))
+        if name == ALL:
+            return not Path(name).exists() or _is_another_folder(Path(name))
+        return not Path(name).exists() and any(sign in name for sign in "*?[")
     return isinstance(weights, Sequence)
 
 

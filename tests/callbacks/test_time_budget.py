@@ -145,6 +145,20 @@ def test_time_of_an_earlier_sitting_counts(tmp_path: Path, monkeypatch: pytest.M
     assert len(second.rates) == 6
 
 
+@pytest.mark.parametrize("steps", [12, 20])
+def test_the_fewest_steps_are_trained_whatever_they_take(
+    steps: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """And the schedule ends with them: not before, and not long after."""
+    budget = TimeBudget(8.0, fewest=12)
+    line = run(tmp_path, monkeypatch, steps, budget)
+    assert budget.ended
+    assert len(line.rates) == 12
+    assert line.rates[-1] < 0.1
+    assert line.rates[1:] == sorted(line.rates[1:], reverse=True)
+    assert line.spent == pytest.approx([step / 12 for step in range(12)])
+
+
 def test_no_time_is_refused() -> None:
     with pytest.raises(UserError, match="must be positive"):
         TimeBudget(0.0)

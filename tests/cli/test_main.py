@@ -48,6 +48,7 @@ REFUSED = {
     "export checkpoint=999_nothing": "no weights of that name (002_master_chef_can, "
     "003_cracker_box",
     "export checkpoint=weights/025_mug.ckpt": "did you mean checkpoint=025_mug?",
+    "export checkpoint=003_cracker_box": "out: is missing; name the file to write",
     "fly": "fly: there is no such command; choose train, evaluate",
 }
 OWN = {**os.environ, "PYTHONPATH": str(HOME / "src")}  # wherever it is started

@@ -89,6 +89,7 @@ def test_the_time_of_measuring_and_of_building_is_not_given_to_the_training(
     assert values["steps"] * values["seconds_per_step"] == pytest.approx(30 * 60 - 70)
     (budget,) = run.callbacks
     assert budget.seconds == pytest.approx(30 * 60 - 70 - 20)
+    assert budget.fewest == 100  # which docs/onboard.md promises, however slow the machine is
 
 
 @pytest.fixture

@@ -122,3 +122,40 @@ def test_what_is_taken_over_leaves_out_the_speed_of_other_workers(
     assert taken is not None
     assert [taken[key] for key in ("seconds_per_step", "cpu_seconds_per_step")] == [seconds] * 2
     assert reason in " ".join(capsys.readouterr().out.split())
+
+
+@pytest.mark.parametrize("is_kept", [True, False])
+def test_what_is_taken_over_is_of_the_job_that_was_trained(
+    is_kept: bool,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """`filter.particles=100` stands before `=50` in the order of names, and holds its weights."""
+    checkpoints = {}
+    known = {}
+    for particles in (50, 100, 1000):
+        folder = tmp_path / f"filter.particles={particles}"
+        (folder / "checkpoints").mkdir(parents=True)
+        (folder / "checkpoints" / "best.ckpt").touch()
+        checkpoints[folder / "checkpoints" / "best.ckpt"] = {
+            "recipe": {"choices": {}, "settings": {"filter": {"particles": particles}}}
+        }
+        known[folder] = {"training": {"learned_from": "this"}}
+    known[tmp_path / "filter.particles=100"]["training"]["trained_as"] = "filter.particles=50"
+    known[tmp_path / "filter.particles=1000"] = {}
+    if not is_kept:
+        known[tmp_path / "filter.particles=50"] = {}
+    now = checkpoints[tmp_path / "filter.particles=1000" / "checkpoints" / "best.ckpt"]["recipe"]
+    monkeypatch.setattr(reuse, "own_metrics", lambda folder: known[folder])
+    monkeypatch.setattr(reuse, "learned_from", lambda job: "this")
+    monkeypatch.setattr(reuse, "recipe", lambda job: now)
+    monkeypatch.setattr(reuse, "read_checkpoint", lambda file: dict(checkpoints[file]))
+    cfg = SimpleNamespace(console="rich")
+    job = SimpleNamespace(swept=True, folder=tmp_path / "filter.particles=1000", cfg=cfg)
+    taken = take_over(job)  # type: ignore[arg-type]
+    assert taken is not None
+    assert taken["trained_as"] == "filter.particles=50"
+    said = " ".join(capsys.readouterr().out.split())
+    assert "with what filter.particles=50 has learned" in said
+    assert said.endswith("was chosen by validations of filter.particles=50")

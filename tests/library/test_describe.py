@@ -79,9 +79,11 @@ def test_the_pose_of_what_is_absent_raises_no_doubts(
     verdict: str, told: list[str], capsys: pytest.CaptureFixture[str]
 ) -> None:
     """They would blame intrinsics that are right."""
+    pose = np.eye(4)
+    pose[:3, 3] = [-0.0493, 0.014, 0.597]
     one = answer(
         verdict,
-        pose=np.eye(4),
+        pose=pose,
         seconds=0.5,
         describe=lambda: "box",
         calibration=None,
@@ -92,6 +94,8 @@ def test_the_pose_of_what_is_absent_raises_no_doubts(
     )
     print_result(one)  # type: ignore[arg-type]
     lines = capsys.readouterr().out.splitlines()
+    at = "" if verdict == "absent" else ", at [-49.3  14.0 597.0] mm"  # a digit each
+    assert lines[0] == f"box{at}, 0.50 s"
     assert [line for line in lines if line.startswith("warning")] == [
         f"warning: {one}" for one in told
     ]

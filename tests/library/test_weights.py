@@ -222,3 +222,25 @@ def test_a_list_a_pattern_and_all_stand_for_several(tmp_path: Path) -> None:
 def test_a_folder_that_is_no_runs_is_told_as_one(tmp_path: Path) -> None:
     with pytest.raises(UserError, match=r"is a folder without checkpoints/best\.ckpt"):
         find_checkpoint(tmp_path)
+
+
+def test_a_folder_of_images_or_results_does_not_hide_weights_of_its_name(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """`checkpoint=003_cracker_box out=003_cracker_box` makes the folder before it looks."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "003_cracker_box").mkdir()
+    (tmp_path / "all").mkdir()
+    shipped = list_shipped()
+    assert find_checkpoint("003_cracker_box") == shipped["003_cracker_box"]
+    assert expand_weights("all") == [*shipped.values()]
+
+    # a run's folder is meant, even one that holds no checkpoint yet
+    for name in ("003_cracker_box", "all"):
+        (tmp_path / name / "checkpoints").mkdir()
+        with pytest.raises(UserError, match=r"is a folder without checkpoints/best\.ckpt"):
+            find_checkpoint(name)
+        best = tmp_path / name / "checkpoints" / "best.ckpt"
+        best.touch()
+        assert find_checkpoint(name).resolve() == best
+    assert expand_weights("all") == ["all"]

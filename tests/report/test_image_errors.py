@@ -81,6 +81,12 @@ def test_ranges_of_visibility_hold_each_image_once_and_in_order() -> None:
     for before, after in pairwise(parts):
         assert max(row.visibility for row in before) <= min(row.visibility for row in after)
     assert group_by_visibility(rows[:10]) == []  # too few to tell apart
+    whole = [make_row(number, 1.0, min(1.0, 0.5 + number / 60)) for number in range(60)]
+    *below, last = group_by_visibility(whole)  # 30 of them show the whole object
+    assert sorted(row.im_id for part in [*below, last] for row in part) == list(range(60))
+    assert sum(row.visibility == 1 for row in last) == 30
+    assert {len(part) for part in below} <= {8, 9}
+    assert group_by_visibility([make_row(number, 1.0) for number in range(60)]) == []
     (curve,) = (
         panel for panel in chart_errors({"": rows}) if panel.title.startswith("ADD < 0.1 diameter")
     )
@@ -243,7 +249,8 @@ def test_a_turn_that_is_a_symmetry_decides_nothing() -> None:
     assert cdf.xlabel == "threshold of the ADD up to symmetry [mm]"
     assert [line.y[-1] for line in cdf.lines] == [100.0, 100.0]
     assert max(cdf.lines[1].x[:-1]) == 4.0
-    own, auc, recall = chart_errors({"": turned})
+    hidden = [row._replace(visibility=0.5 + i / 40) for i, row in enumerate(turned)]
+    own, auc, recall = chart_errors({"": hidden})
     assert [line.label for line in own.lines] == ["ADD up to symmetry", "ADD", "ADD-S"]
     assert auc.title == "ADD up to symmetry AUC by visibility"
     assert set(recall.lines[0].y) == {100.0}

@@ -349,7 +349,9 @@ def test_without_the_viewers_library_a_view_is_refused_before_anything_is_done(
 
 
 @pytest.mark.skipif(importlib.util.find_spec("rerun") is None, reason="needs the extra [viz]")
-def test_a_view_of_the_tracks_is_written(folder: Path, tmp_path: Path) -> None:
+def test_a_view_of_the_tracks_is_written(
+    folder: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
     out = tmp_path / "out"
     typed = [
         *COMMON,
@@ -361,6 +363,7 @@ def test_a_view_of_the_tracks_is_written(folder: Path, tmp_path: Path) -> None:
     ]
     assert run_command("track", HOME, typed) == 0
     assert (out / "view.rrd").stat().st_size > 10_000
+    assert json.loads(capfd.readouterr().out.splitlines()[-1])["next"] == [f"rerun {out}/view.rrd"]
 
 
 def test_a_scene_of_a_dataset_is_tracked_with_its_errors(tmp_path: Path) -> None:

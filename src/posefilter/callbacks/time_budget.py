@@ -24,17 +24,18 @@ class TimeBudget(Callback):
         seconds: For all steps, validations not counted as steps but as time.
         clock: "wall", or "cpu" for the process's own processor time, the sum over its threads: on a
             machine that others use, too, it gives every training as much.
+        fewest: Number of steps that are trained even where they take longer than `seconds`.
 
     Raises:
         UserError: `seconds` is not positive, or there is no such clock.
     """
 
-    def __init__(self, seconds: float, clock: str = "wall") -> None:
+    def __init__(self, seconds: float, clock: str = "wall", fewest: int = 0) -> None:
         if not seconds > 0:
             raise UserError(f"time budget of {seconds} s: must be positive")
         if clock not in _CLOCKS:
             raise UserError(f"time budget by the clock {clock}: choose {' or '.join(_CLOCKS)}")
-        self.seconds, self.clock = seconds, clock
+        self.seconds, self.clock, self.fewest = seconds, clock, fewest
         self.spent = 0.0  # in earlier sittings [s]
         self.ended = False  # whether its time is up, or the schedule's
         self._began = self.now()
@@ -64,6 +65,8 @@ class TimeBudget(Callback):
     def on_train_batch_end(self, trainer: Trainer, pl_module: Any, *_: Any) -> None:
         """Advance the schedule to where the clock is; stop if the time is up."""
         share = min(1.0, self.elapsed / self.seconds)
+        if trainer.global_step < self.fewest:
+            share = min(share, trainer.global_step / self.fewest)
         if trainer.world_size > 1:  # their clocks differ, and their weights must not
             share = trainer.strategy.broadcast(share)
         pl_module.time_spent = share

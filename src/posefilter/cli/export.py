@@ -24,8 +24,6 @@ def export(job: Job) -> None:
     """Write the stripped checkpoint, which works wherever the whole one did, but for going on with
     training; or with `format=onnx|torch` the networks.
     """
-    if job.cfg.out is None:
-        raise UserError("out: is missing; name the file to write, such as out=weights/carton.ckpt")
     out = Path(str(job.cfg.out))
     if job.cfg.format != "weights":
         export_networks(job, out)

@@ -425,14 +425,17 @@ def train(work: Onboarding) -> None:
         work.stages.keep(steps=steps, seconds_per_step=seconds)
         duration = format_duration(steps * seconds)
         fixed = f"{steps} steps of {seconds:.2f} s each: {duration}"
-        sentence = fixed if work.cfg.steps else f"at most {steps} steps in {duration}"
+        fitting = f"at most {steps} steps in {duration}"
+        if steps == _FEWEST_STEPS:
+            fitting = f"{steps} steps, the fewest that are trained: about {duration}"
+        sentence = fixed if work.cfg.steps else fitting
         say(console, "steps", sentence, steps=steps, seconds_per_step=seconds)
     if work.cfg.steps is None:  # the machine may turn out slower than it was measured
         seconds = values["steps"] * values["seconds_per_step"]
         began = time.perf_counter()
         callbacks = work.run.trainer.callbacks  # built here, and the frames' list read: that counts
         seconds = max(seconds / 2, seconds - (time.perf_counter() - began))
-        callbacks.append(TimeBudget(seconds))
+        callbacks.append(TimeBudget(seconds, fewest=_FEWEST_STEPS))
     work.stages.keep(training=fit(work.run))
 
 

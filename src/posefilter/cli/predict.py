@@ -220,7 +220,9 @@ def mark_result(result: Result, shape: Shape) -> Drawn:
 
 def print_result(result: Result) -> None:
     """Print whether and where the object is, and what speaks against it."""
-    place = np.array2string(1000 * result.pose[:3, 3], precision=1, suppress_small=True)
+    place = np.array2string(
+        1000 * result.pose[:3, 3], precision=1, floatmode="fixed", suppress_small=True
+    )
     absent = result.verdict == "absent"
     if result.verdict is None:
         print(f"{result.object} at {place} mm, {result.seconds:.2f} s")

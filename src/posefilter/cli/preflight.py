@@ -40,6 +40,7 @@ _NEEDED = {
         ("bag", "out", "checkpoint"),
         "type convert_bag in.mcap out.mcap checkpoint=...",
     ),
+    "export": (("out",), "name the file to write, such as out=weights/carton.ckpt"),
     "onboard": (("mesh",), "name an .obj, .ply or .glb file"),
     "predict": (
         ("rgb", "depth", "intrinsics"),

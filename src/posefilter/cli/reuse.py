@@ -82,29 +82,34 @@ def take_over(job: Job) -> dict[str, Any] | None:
     if not job.swept:
         return None
     wanted = learned_from(job)
+    alike: list[tuple[Path, dict[str, Any]]] = []
     for folder in sorted(job.folder.parent.iterdir()):
-        best = folder / "checkpoints" / "best.ckpt"
-        training = own_metrics(folder).get("training", {}) if best.is_file() else {}
-        if folder == job.folder or training.get("learned_from") != wanted:
-            continue
-        checkpoint = read_checkpoint(best)
-        then, now = checkpoint["recipe"], recipe(job)
-        others = differing(then, now)
-        if find(then["settings"], _WORKERS) != find(now["settings"], _WORKERS):
-            others.append(_WORKERS)
-            training = {**training, **dict.fromkeys(_SPEEDS)}
-        if not is_calibrated_filter(now["settings"], then["settings"]):
-            checkpoint.pop("calibration", None)
-        save_whole({**checkpoint, "recipe": now}, job.folder / "checkpoints" / "best.ckpt")
-        # there are none where what differs is no setting of a training, as a logger
-        reason = f"training does not depend on {', '.join(others)}, but " if others else ""
-        sentence = (
-            f"{job.folder.name}: only tested, with what {folder.name} has learned; {reason}its "
-            f"best checkpoint was chosen by validations of {folder.name}"
-        )
-        say(job.cfg.console, "reused", sentence, run=str(job.folder), trained=str(folder))
-        return {**training, "trained_as": folder.name}
-    return None
+        has_weights = (folder / "checkpoints" / "best.ckpt").is_file()
+        training = own_metrics(folder).get("training", {}) if has_weights else {}
+        if folder != job.folder and training.get("learned_from") == wanted:
+            alike.append((folder, training))
+    if not alike:
+        return None
+    # first a job that was trained: a copy of its weights may stand before it, and chose no step
+    folder, training = min(alike, key=lambda entry: "trained_as" in entry[1])
+    trainer = training.get("trained_as", folder.name)
+    checkpoint = read_checkpoint(folder / "checkpoints" / "best.ckpt")
+    then, now = checkpoint["recipe"], recipe(job)
+    others = differing(then, now)
+    if find(then["settings"], _WORKERS) != find(now["settings"], _WORKERS):
+        others.append(_WORKERS)
+        training = {**training, **dict.fromkeys(_SPEEDS)}
+    if not is_calibrated_filter(now["settings"], then["settings"]):
+        checkpoint.pop("calibration", None)
+    save_whole({**checkpoint, "recipe": now}, job.folder / "checkpoints" / "best.ckpt")
+    # there are none where what differs is no setting of a training, as a logger
+    reason = f"training does not depend on {', '.join(others)}, but " if others else ""
+    sentence = (
+        f"{job.folder.name}: only tested, with what {trainer} has learned; {reason}its "
+        f"best checkpoint was chosen by validations of {trainer}"
+    )
+    say(job.cfg.console, "reused", sentence, run=str(job.folder), trained=str(folder))
+    return {**training, "trained_as": trainer}
 
 
 def start_from(job: Job) -> tuple[Path | None, int]:

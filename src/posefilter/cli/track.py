@@ -1,6 +1,7 @@
 """Follow objects through videos: poses, figures, and an annotated video."""
 
 import math
+import shlex
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import closing
@@ -113,7 +114,8 @@ def track(job: Job) -> None:
     files |= {"tracks": folder / "tracks.csv", "metrics": folder / "metrics.json"}
     for name, figures in metrics.items():
         show_table(cfg.console, name, list_figures(figures))
-    ended(cfg.console, "tracked", files, [], metrics=metrics)
+    following = [f"rerun {shlex.quote(str(f))}" for f in files.values() if f.suffix == ".rrd"]
+    ended(cfg.console, "tracked", files, following, metrics=metrics)
     if isinstance(broken, UserError):
         count = len({(row.video, row.frame) for row in rows})
         raise UserError(f"{broken}; the {count} frames before it are in {folder}") from broken

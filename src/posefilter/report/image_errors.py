@@ -55,15 +55,23 @@ def compute_cdf(errors_mm: Sequence[float]) -> tuple[list[float], list[float]]:
 
 
 def group_by_visibility(rows: Sequence[ImageError]) -> list[list[ImageError]]:
-    """Return the images in ranges of their visible share, about as many in each; unknown shares are
-    left out.
+    """Return the images in ranges of their visible share, about as many in each, but that images of
+    one share are in one range; unknown shares are left out.
     """
     known = [row for row in rows if math.isfinite(row.visibility)]
     known.sort(key=lambda row: row.visibility)
     count = min(MOST, len(known) // FEWEST)
     if count < 2:
         return []
-    return [[known[i] for i in part] for part in np.array_split(np.arange(len(known)), count)]
+    parts = list[list[ImageError]]()
+    for numbers in np.array_split(np.arange(len(known)), count):
+        part = [known[i] for i in numbers]
+        # often half of the images show the whole object: cut apart, they would differ by chance
+        if parts and parts[-1][-1].visibility == part[0].visibility:
+            parts[-1] += part
+        else:
+            parts.append(part)
+    return parts if len(parts) > 1 else []
 
 
 def chart_errors(runs: Mapping[str, Sequence[ImageError]]) -> list[Panel]:
