@@ -9,7 +9,7 @@ import torch
 
 from posefilter.cli.checkpoints import build_method, recipe
 from posefilter.cli.command import compose_job
-from posefilter.cli.warm_start import read_starts, warm_start
+from posefilter.cli.warm_start import name_modules, read_starts, warm_start
 from posefilter.errors import UserError
 from posefilter.meshes.store import MeshStore, object_model
 from posefilter.models.base import PoseEstimator
@@ -47,7 +47,7 @@ def test_weights_are_copied_and_the_object_stays(model: str, tmp_path: Path) -> 
             if name.endswith("running_mean"):
                 value.fill_(0.25)
     copied, left = warm_start(new, [{"state_dict": old.state_dict()}])
-    assert (copied > 20, left) == (True, 0)
+    assert (copied > 20, left) == (True, [])
     theirs = dict(old.named_parameters())
     for name, value in new.named_parameters():
         assert torch.equal(value, theirs[name]), name
@@ -57,6 +57,17 @@ def test_weights_are_copied_and_the_object_stays(model: str, tmp_path: Path) -> 
         if name.endswith("running_mean"):
             assert bool((value == 0.25).all()), name
     assert new.object_model.name == "mug"
+
+
+def test_what_begins_at_random_is_named(tmp_path: Path) -> None:
+    old, new = (build(tmp_path, "carton", seed, "model=pose_pf") for seed in (0, 1))
+    there = old.state_dict()
+    lacking = {name for name, _ in new.named_parameters() if name.startswith("likelihood.surface.")}
+    _, left = warm_start(
+        new, [{"state_dict": {k: v for k, v in there.items() if k not in lacking}}]
+    )
+    assert set(left) == lacking
+    assert name_modules(left) == f"likelihood.surface ({len(lacking)} tensors)"
 
 
 def test_exported_weights_are_read_too(tmp_path: Path) -> None:
@@ -86,7 +97,7 @@ def test_several_start_as_their_mean_and_what_one_lacks_is_of_the_others(tmp_pat
     lacking = next(name for name, _ in one.named_parameters() if "likelihood" in name)
     del there[lacking]
     copied, left = warm_start(new, [{"state_dict": one.state_dict()}, {"state_dict": there}])
-    assert (copied > 20, left) == (True, 0)
+    assert (copied > 20, left) == (True, [])
     for name, value in new.named_parameters():
         first = dict(one.named_parameters())[name]
         mean = first if name == lacking else (first + there[name]) / 2

@@ -57,6 +57,7 @@ NERF |= {"k1": 0.0, "k2": 0.0, "p1": 0.0, "p2": 0.0, "camera_model": "OPENCV", "
         ),
         ("rows.json", {"K": K}, None),
         ("bare.json", K, None),
+        ("four.json", list(FOUR.values()), None),
         ("scene_camera.json", {"0": {"cam_K": K.ravel()}, "7": {"cam_K": K.ravel()}}, None),
         ("info.yaml", f"height: 480\nwidth: 640\nk: {K.ravel().tolist()}\nd: []\n", SIZE),
         ("echo.yaml", f"height: 480\nwidth: 640\nk: {K.ravel().tolist()}\nd: []\n---\n", SIZE),
@@ -84,6 +85,7 @@ def test_a_camera_is_read_of_any_form(
     ("name", "content", "told"),
     [
         ("a.json", "[1, 2]", "holds no camera"),
+        ("a.json", '[1, 2, "a", 3]', "'intrinsics' is not numbers"),
         ("a.json", '{"width": 640}', r"expected fx, fy, cx, cy or a matrix; it has width"),
         ("a.json", '{"K": [1, 2, 3]}', "wrong size"),
         ("a.json", '{"fx": "a", "fy": 1, "cx": 1, "cy": 1}', "'fx' is not numbers"),

@@ -31,7 +31,7 @@ from posefilter.cli.results import record, show, write_json
 from posefilter.cli.resume import LAST, list_unkept
 from posefilter.cli.reuse import find_begun, finished, learned_from, start_from, take_over
 from posefilter.cli.stopping import stopped_by_interrupt
-from posefilter.cli.warm_start import read_starts, warm_start
+from posefilter.cli.warm_start import name_modules, read_starts, warm_start
 from posefilter.data.loaders import count_batches
 from posefilter.data.module import PoseDataModule
 from posefilter.errors import Stopped, UserError, naming
@@ -100,8 +100,9 @@ def build(job: Job) -> Run:
     if job.cfg.warm_start and find_begun(job) is None:  # else its own checkpoint has them
         starts = read_starts(job.cfg.warm_start, object_model.name)
         copied, left = warm_start(method, starts)
-        said = "warm start from %s (%d files): %d tensors copied, %d left as drawn"
-        log.info(said, job.cfg.warm_start, len(starts), copied, left)
+        log.info("warm start from %s: %d tensors copied", job.cfg.warm_start, copied)
+        if left:
+            log.info("not in %s, and begin at random: %s", job.cfg.warm_start, name_modules(left))
     rehearse(method, data)
     data.check_test()  # which comes last
     if find_begun(job) is not None:

@@ -1,6 +1,7 @@
 """Begin a run with weights of finished ones, also of other objects: most of it is shared."""
 
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import torch
@@ -32,7 +33,9 @@ def read_starts(weights: Any, own: str) -> list[dict[str, Any]]:
     return found if len(found) == 1 or not others else others
 
 
-def warm_start(method: PoseEstimator, checkpoints: Sequence[dict[str, Any]]) -> tuple[int, int]:
+def warm_start(
+    method: PoseEstimator, checkpoints: Sequence[dict[str, Any]]
+) -> tuple[int, list[str]]:
     """Copy the mean of checkpoints' weights into a method, wherever name and shape agree.
 
     Networks that were trained from a common ancestor lie in one basin of the loss, so that their
@@ -47,7 +50,7 @@ def warm_start(method: PoseEstimator, checkpoints: Sequence[dict[str, Any]]) -> 
             some of them have is the mean of those.
 
     Returns:
-        How many tensors were copied, and how many of the method's were not found.
+        How many tensors were copied, and the names of the method's that were not found.
 
     Raises:
         UserError: if fewer than half of the method's tensors fit one of the checkpoints.
@@ -66,14 +69,23 @@ def warm_start(method: PoseEstimator, checkpoints: Sequence[dict[str, Any]]) -> 
                 f"warm_start: only {count} of {len(wanted)} tensors fit; "
                 "the checkpoint comes from another model, or has other widths"
             )
-    copied = 0
+    left = []
     with torch.no_grad():
         for name, value in wanted.items():
             found = [state[name].to(value) for state in states if _fits(state, name, value)]
             if found:
                 value.copy_(found[0] if len(found) == 1 else torch.stack(found).double().mean(0))
-                copied += 1
-    return copied, len(wanted) - copied
+            else:
+                left.append(name)
+    return len(wanted) - len(left), left
+
+
+def name_modules(names: Iterable[str]) -> str:
+    """Return the modules that parameters belong to, with how many each has: `likelihood.surface
+    (6 tensors)`.
+    """
+    counts = Counter(".".join(name.split(".")[:-1][:2]) or name for name in names)
+    return ", ".join(f"{module} ({count} tensors)" for module, count in counts.items())
 
 
 def _fits(state: dict[str, Tensor], name: str, value: Tensor) -> bool:

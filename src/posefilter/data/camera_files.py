@@ -119,6 +119,8 @@ def _of_mapping(content: Any, path: Path) -> CameraFile:
         and [len(row) for row in content if isinstance(row, list)] == [3] * 3
     ):
         content = {"K": content}
+    if isinstance(content, list) and len(content) == 4:
+        content = {"intrinsics": content}
     if not isinstance(content, Mapping):
         raise BadData(path, "holds no camera", "expected fx, fy, cx, cy or a matrix by name")
     kalibr = [key for key in content if re.fullmatch(r"cam\d+", str(key))]
