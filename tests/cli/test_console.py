@@ -268,3 +268,8 @@ def test_words_and_hydras_own_log() -> None:
 def test_a_title_is_not_cut_where_its_table_is_narrower(capsys) -> None:
     show_table("rich", "003_cracker_box", [("frames", "1"), ("lost", "0")])
     assert capsys.readouterr().out.splitlines()[0].rstrip() == "003_cracker_box"
+    path = "outputs/runs/" + "2026-01-01_a_run_of_a_long_name/" * 5 + "checkpoints/best.ckpt"
+    show_table("rich", path, [("frames", "1")])
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0].rstrip() == path
+    assert len(lines[1]) < 30

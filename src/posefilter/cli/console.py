@@ -65,13 +65,14 @@ def show_table(console: str, title: str, rows: Sequence[tuple[str, str]]) -> Non
     """Print a table of names and values; for machines, nothing."""
     if is_follower() or console == JSON:
         return
-    # a title is cut where the table is narrower
-    table = Table("", "", title=Text(title), show_header=False, min_width=len(title))
-    table.title_justify, table.title_style = "left", "bold"
+    table = Table("", "", show_header=False)
     table.columns[1].justify = "right"
     for row in rows:
         table.add_row(*(Text(cell) for cell in row))
-    Console().print(table)
+    terminal = Console()
+    # a line of its own: within the table a path would be cut in the middle of words
+    terminal.print(Text(title, style="bold"), soft_wrap=True)
+    terminal.print(table)
 
 
 def typed(command: str, **settings: Any) -> str:
