@@ -22,6 +22,7 @@ from posefilter.cli.choices import check_added, check_choices
 from posefilter.cli.command import compose_config
 from posefilter.cli.explain import near
 from posefilter.cli.job import Job, check_settings
+from posefilter.cli.preflight import check_files
 from posefilter.errors import MISTAKE, UserError
 
 HOME = Path(__file__).parents[2]
@@ -213,6 +214,31 @@ def test_a_sweep_gives_each_job_a_folder_of_its_own(
 def test_folders_are_not_named_after_what_is_not_swept() -> None:
     for typed in (["-m", "data.root=A", "seed=1,2"], ["data.root=A"], ["seed=1"]):
         assert told_apart(typed, "train", HOME / "conf") == typed
+
+
+@pytest.mark.parametrize(
+    ("command", "typed", "told"),
+    [
+        (
+            "export",
+            ["checkpoint=003_cracker_box", "format=onnx", "out=x"],
+            "format=onnx: the package o",
+        ),
+        ("generate", ["settle=true"], "settle=true: the package mujoco"),
+        ("generate", ["renderer=opengl"], "renderer=opengl: the package moderngl"),
+        ("generate", [], ""),
+    ],
+)
+def test_a_package_that_is_missing_is_named_at_once(
+    command: str, typed: list[str], told: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("posefilter.cli.preflight.find_spec", lambda name: None)
+    cfg = compose_config(command, typed)
+    if told:
+        with pytest.raises(UserError, match=told):
+            check_files(command, cfg)
+    else:
+        check_files(command, cfg)
 
 
 def test_options_may_stand_anywhere() -> None:

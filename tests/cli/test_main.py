@@ -34,6 +34,10 @@ REFUSED = {
     "predict": "checkpoint: is missing",
     "predict checkpoint=003_cracker_box": "rgb: is missing",
     "predict checkpoint=003_cracker_box rgb=a.png depth=b.png intrinsics=1,1,1,1": "rgb=a.png: no",
+    "predict checkpoint=003_cracker_box rgb=a depth=b intrinsics=no.json": "intrinsics=no.json: no "
+    "such file",
+    "track checkpoint=003_cracker_box frames=. intrinsics=1,2,3": "intrinsics=[1, 2, 3]: expected "
+    "four numbers, fx,fy,cx,cy",
     "predict checkpoint=003_cracker_box rgb=. depth=. intrinsics=1,1,1,1": "rgb=.: is a folder; "
     "predict takes one image, and track frames=DIR a folder of them",
     "evaluate estimates=.": "estimates=.: is a folder",

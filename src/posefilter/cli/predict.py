@@ -17,6 +17,7 @@ from posefilter.cli.console import JSON, ended
 from posefilter.cli.job import Job
 from posefilter.cli.machine import settle
 from posefilter.cli.plain import key_of
+from posefilter.cli.preflight import parse_intrinsics
 from posefilter.cli.results import write_json
 from posefilter.cli.shapes import load_shape, open_shapes
 from posefilter.confidence.tolerance import PoseTolerance, read_pose_tolerance
@@ -446,22 +447,9 @@ def read_intrinsics(typed: Any, distorted: bool = False) -> CameraFile:
         UserError: It is none of these; or the file tells a distortion, and none is typed: it does
             not tell whether the images are rectified.
     """
-    parts = list(typed) if isinstance(typed, ListConfig | list) else str(typed).split(",")
-    try:
-        values = [float(part) for part in parts]
-    except (TypeError, ValueError) as error:
-        file = str(parts[0])
-        if len(parts) == 1 and Path(file).suffix and not Path(file).exists():
-            raise UserError(f"intrinsics={typed}: no such file") from error
-        if len(parts) > 1 or not Path(file).exists():
-            raise UserError(
-                f"intrinsics={typed}: expected four numbers, fx,fy,cx,cy [px], or a camera's file"
-            ) from error
-        return _read_camera(Path(file), distorted)
-    if len(values) not in (4, 9):
-        raise UserError(f"intrinsics={typed}: expected four numbers, fx,fy,cx,cy [px]")
-    if not np.isfinite(values).all():
-        raise UserError(f"intrinsics={typed}: hold NaN or infinity")
+    values = parse_intrinsics(typed)
+    if isinstance(values, Path):
+        return _read_camera(values, distorted)
     if len(values) == 4:
         fx, fy, cx, cy = values
         values = [fx, 0, cx, 0, fy, cy, 0, 0, 1]

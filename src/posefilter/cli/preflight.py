@@ -1,10 +1,11 @@
 """Whether the files that a command is told to read are there; torch is not needed for it."""
 
+import math
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig, ListConfig, OmegaConf
 
 from posefilter.cli.arguments import TYPED
 from posefilter.cli.choices import read_settings
@@ -28,6 +29,14 @@ _FOLDERS = {
 }
 _ONE_IMAGE = "is a folder; predict takes one image, and track frames=DIR a folder of them"
 _IS_FOLDER = {"rgb": _ONE_IMAGE, "depth": _ONE_IMAGE, "estimates": "is a folder; name a file in it"}
+# by command: a setting and its value that need packages, and the extra that has these
+_PACKAGES = {
+    "export": (("format", "onnx", ("onnx", "onnxscript"), "export"),),
+    "generate": (
+        ("settle", True, ("mujoco",), "sim"),
+        ("renderer", "opengl", ("moderngl",), "moderngl"),
+    ),
+}
 # by the class of a logger: the package that it needs, which is an extra of ours by the same name
 _LOGGERS = {
     "lightning.pytorch.loggers.MLFlowLogger": "mlflow",
@@ -76,6 +85,8 @@ def check_files(command: str, cfg: DictConfig) -> None:
     for key in keys:
         if cfg[key] is None:
             raise UserError(f"{key}: is missing; {how}")
+    if command in ("predict", "track") and cfg.intrinsics is not None:
+        parse_intrinsics(cfg.intrinsics)
     if command == "convert_bag":
         _check_bag(cfg)
     if command == "onboard":
@@ -87,6 +98,10 @@ def check_files(command: str, cfg: DictConfig) -> None:
             raise UserError(
                 f"train_overrides={more}: must be a list, such as ['filter.particles=200']"
             )
+    for key, value, packages, extra in _PACKAGES.get(command, ()):
+        missing = [one for one in packages if cfg[key] == value and find_spec(one) is None]
+        if missing:
+            raise missing_package(f"{key}={str(value).lower()}", missing[0], extra)
     if command == "check_data" and cfg.data.meshes is None:
         raise UserError("meshes: is missing; choose builtin, or name a folder of meshes")
     for key in (*_FILES.get(command, ()), *_FOLDERS.get(command, ())):
@@ -103,6 +118,30 @@ def check_files(command: str, cfg: DictConfig) -> None:
             continue  # it is rendered
         found = "is a file, and no folder" if Path(str(folder)).exists() else "no such folder"
         raise UserError(f"{TYPED.get(key, key)}={folder}: {found}")
+
+
+def parse_intrinsics(typed: Any) -> list[float] | Path:
+    """Return the numbers of `intrinsics=`, four or the nine of a matrix, or the file that it names.
+
+    Raises UserError where it is none of these.
+    """
+    parts = list(typed) if isinstance(typed, ListConfig | list) else str(typed).split(",")
+    try:
+        values = [float(part) for part in parts]
+    except (TypeError, ValueError) as error:
+        file = Path(str(parts[0]))
+        if len(parts) == 1 and file.exists():
+            return file
+        if len(parts) == 1 and file.suffix:
+            raise UserError(f"intrinsics={typed}: no such file") from error
+        raise UserError(
+            f"intrinsics={typed}: expected four numbers, fx,fy,cx,cy [px], or a camera's file"
+        ) from error
+    if len(values) not in (4, 9):
+        raise UserError(f"intrinsics={typed}: expected four numbers, fx,fy,cx,cy [px]")
+    if not all(map(math.isfinite, values)):
+        raise UserError(f"intrinsics={typed}: hold NaN or infinity")
+    return values
 
 
 def _check_bag(cfg: DictConfig) -> None:
