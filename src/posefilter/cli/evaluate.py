@@ -394,9 +394,10 @@ def check_own_folders(data: DictConfig, job: Job) -> None:
     rendered = any(key.startswith("generate") for key in keys)
     for key in ("meshes",) if rendered else ("root", "meshes"):
         folder = data.get(key)
-        if key not in keys and isinstance(folder, str) and folder != "builtin":
-            if not Path(folder).is_dir():
-                raise UserError(no_own_folder(key, folder))
+        if key in keys or not isinstance(folder, str) or folder == "builtin":
+            continue
+        if not Path(folder).is_dir():
+            raise UserError(no_own_folder(key, folder))
 
 
 def _is_of_split(key: str) -> bool:
