@@ -250,7 +250,8 @@ def test_the_settings_of_another_command_are_refused(
 def test_a_trainers_choices_are_those_of_a_training(capfd: pytest.CaptureFixture[str]) -> None:
     """evaluate's has no steps."""
     assert run_command("train", HOME, ["trainer=cpu"]) == 2
-    assert "trainer=cpu: there is no such choice; there are default; " in capfd.readouterr().err
+    told = "trainer=cpu: there is no such choice; there are default; one of your own needs "
+    assert f"{told}plugins=[PACKAGE] or --config-dir DIR" in capfd.readouterr().err
 
 
 def test_settings_of_ones_own_that_choose_no_method_are_told_what_is_missing() -> None:
