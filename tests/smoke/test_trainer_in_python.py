@@ -94,6 +94,23 @@ def test_a_method_that_detects_is_read_back(pair: Callable[[str], Pair], tmp_pat
     assert trainer.global_step == 2
 
 
+def test_what_was_trained_with_a_compiled_network_is_read_back(
+    pair: Callable[[str], Pair], tmp_path: Path
+) -> None:
+    """`torch.compile` has the names of its weights in the checkpoint begin with another."""
+    method, data = pair("cnn_patch")
+    plain = {*method.state_dict()}
+    method.encoder = torch.compile(method.encoder, backend="eager")
+    trainer = make_trainer(tmp_path, max_steps=1, limit_val_batches=0)
+    trainer.fit(method, data)
+    trainer.save_checkpoint(tmp_path / "own.ckpt", weights_only=False)
+    assert {*method.state_dict()} != plain
+    again = posefilter.load_method(tmp_path / "own.ckpt").state_dict()
+    assert {*again} == plain
+    for key, value in method.state_dict().items():
+        assert torch.equal(value, again[key.replace("_orig_mod.", "")])
+
+
 def test_a_fit_that_goes_on_for_longer_than_its_schedule_is_refused(
     pair: Callable[[str], Pair], tmp_path: Path
 ) -> None:
