@@ -372,6 +372,13 @@ def test_bags_at_home_are_places() -> None:
     assert name_places(typed) == ["bag=~/in.bag", "out=~/out.bag", "~logger"]
 
 
+@pytest.mark.parametrize("option", ["--cfg job", "-c hydra", "--config-dir own", "--info defaults"])
+def test_the_value_of_an_option_is_no_bag(option: str) -> None:
+    words = option.split()
+    assert name_places([*words, "in.bag", "out.bag"]) == [*words, "bag=in.bag", "out=out.bag"]
+    assert name_places(["in.bag", *words]) == ["bag=in.bag", *words]
+
+
 def test_a_choice_that_is_typed_as_a_setting_is_told_by_todays_name() -> None:
     with pytest.raises(UserError, match=r"type filter/resample=adaptive$"):
         check_choices(["filter.resample=below_ess"], HOME / "conf")
