@@ -9,6 +9,10 @@ import torch
 from posefilter.errors import UserError
 
 _FULL = ("32-true", "32")
+_OTHERS = (  # that Lightning's trainer takes
+    *("16", "64", "16-true", "16-mixed", "bf16", "bf16-true", "bf16-mixed", "64-true"),
+    *("transformer-engine", "transformer-engine-float16"),
+)
 _P = ParamSpec("_P")
 _R = TypeVar("_R")
 
@@ -36,7 +40,14 @@ def in_float32(function: Callable[_P, _R]) -> Callable[_P, _R]:
 
 
 def check_precision(precision: object) -> None:
-    """Raise UserError for a trainer's precision that would blur poses, or fit no network."""
+    """Raise UserError for a trainer's precision that would blur poses, or fit no network, and for
+    one that there is not.
+    """
+    if str(precision) not in (*_FULL, *_OTHERS):
+        raise UserError(
+            f"trainer.precision={precision}: Lightning has none of this name; leave it at 32-true "
+            f"(the others, {', '.join(_OTHERS)}, are refused here)"
+        )
     if str(precision) not in _FULL:
         raise UserError(
             f"trainer.precision={precision}: half precision costs a pose millimeters, and double "

@@ -276,7 +276,8 @@ def test_the_settings_of_another_command_are_refused(
 def test_a_trainers_choices_are_those_of_a_training(capfd: pytest.CaptureFixture[str]) -> None:
     """evaluate's has no steps."""
     assert run_command("train", HOME, ["trainer=cpu"]) == 2
-    assert "trainer=cpu: there is no such choice; there are default; " in capfd.readouterr().err
+    told = "trainer=cpu: there is no such choice; there are default; one of your own needs "
+    assert f"{told}plugins=[PACKAGE] or --config-dir DIR" in capfd.readouterr().err
 
 
 def test_settings_of_ones_own_that_choose_no_method_are_told_what_is_missing() -> None:
@@ -395,6 +396,13 @@ def test_without_a_home_folder_only_what_needs_it_is_refused(
 def test_bags_at_home_are_places() -> None:
     typed = ["~/in.bag", "~/out.bag", "~logger"]
     assert name_places(typed) == ["bag=~/in.bag", "out=~/out.bag", "~logger"]
+
+
+@pytest.mark.parametrize("option", ["--cfg job", "-c hydra", "--config-dir own", "--info defaults"])
+def test_the_value_of_an_option_is_no_bag(option: str) -> None:
+    words = option.split()
+    assert name_places([*words, "in.bag", "out.bag"]) == [*words, "bag=in.bag", "out=out.bag"]
+    assert name_places(["in.bag", *words]) == ["bag=in.bag", *words]
 
 
 def test_a_choice_that_is_typed_as_a_setting_is_told_by_todays_name() -> None:

@@ -13,7 +13,7 @@ from posefilter.cli.build import build_data
 from posefilter.cli.check_data import check_data
 from posefilter.cli.command import FAILURE, compose_job, run_command
 from posefilter.cli.console import setting
-from posefilter.cli.evaluate import data_settings
+from posefilter.cli.evaluate import check_own_folders, data_settings
 from posefilter.cli.generate import generate
 from posefilter.cli.plain import to_plain
 from posefilter.cli.train import places
@@ -62,6 +62,33 @@ def test_a_split_that_is_typed_replaces_the_checkpoints(tmp_path: Path, command:
     assert data_settings(job, own, None).split == {"val": 1.0}
     job = compose_job(command, CONF, [f"++{root}", "++data.split.val=0.2"], tmp_path)
     assert data_settings(job, own, None).split == {**DEFAULTS, "val": 0.2}
+
+
+@pytest.mark.parametrize("key", ["root", "meshes"])
+@pytest.mark.parametrize("folder", ["outputs/data/can", "data/can"])
+def test_a_checkpoints_own_folder_is_told_to_be_relative(
+    key: str, folder: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Typed in another working folder than the training, a command finds no dataset there."""
+    (tmp_path / "scenes").mkdir()
+    typed = ["data.root=scenes", "data.meshes=scenes"]
+    data = compose_job("train", CONF, [*typed, f"data.{key}={folder}"], tmp_path).cfg.data
+    own = {"data": {**OmegaConf.to_container(data, resolve=True), "augment": {}}}
+    monkeypatch.chdir(tmp_path)
+
+    def settle(*overrides: str) -> None:
+        job = compose_job("evaluate", CONF, [*overrides], tmp_path)
+        check_own_folders(data_settings(job, own, "carton"), job)
+
+    told = rf"^data\.{key}={folder}: no such folder here; .* relative to where it was trained"
+    with pytest.raises(UserError, match=told):
+        settle()
+    settle(f"++data.{key}=scenes")
+    settle("data=scenes", "data.root=elsewhere")
+    if key == "root" and folder.startswith("outputs"):  # new scenes are asked for
+        settle("++data.generate.frames=5")
+    (tmp_path / folder).mkdir(parents=True)
+    settle()
 
 
 def test_a_seed_alone_is_no_split(tmp_path: Path) -> None:

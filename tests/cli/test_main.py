@@ -30,6 +30,9 @@ REFUSED = {
     "train plugins=[no_such_package]": "there is no package 'no_such_package'",
     "train plugins=[no_such_package] loss=mine": "there is no package 'no_such_package'",
     "evaluate checkpoint=nowhere.ckpt": "checkpoint=nowhere.ckpt: no such file",
+    "evaluate checkpoint=[003_cracker_box,025_mug]": "checkpoint=[003_cracker_box,025_mug]: "
+    "evaluate takes one; give them one by one, in a sweep: -m checkpoint=A,B",
+    "export checkpoint=all": "checkpoint=all: export takes one; give them one by one",
     "evaluate estimates=nowhere.csv": "estimates=nowhere.csv: no such file",
     "predict": "checkpoint: is missing",
     "predict checkpoint=003_cracker_box": "rgb: is missing",

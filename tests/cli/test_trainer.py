@@ -1,12 +1,20 @@
 """What a trainer may be told."""
 
 import signal
+import subprocess
+import sys
 import warnings
 from dataclasses import replace
 from pathlib import Path
+from typing import get_args
 
 import pytest
 import torch
+from lightning.fabric.plugins.precision.precision import (
+    _PRECISION_INPUT_INT,
+    _PRECISION_INPUT_STR,
+    _PRECISION_INPUT_STR_ALIAS,
+)
 from lightning.pytorch.accelerators import CPUAccelerator
 from omegaconf import OmegaConf
 
@@ -15,8 +23,10 @@ from posefilter.cli.build import list_swept, make_trainer, quiet
 from posefilter.cli.evaluate import make_tester
 from posefilter.cli.instantiate import instantiate
 from posefilter.cli.job import Job
+from posefilter.cli.ranks import check_others
 from posefilter.cli.results import record
-from posefilter.errors import UserError
+from posefilter.errors import ProblemsFound, UserError
+from posefilter.precision import check_precision
 
 HOME = Path(__file__).parents[2]
 SETTINGS = {"_target_": "lightning.Trainer", "accelerator": "cpu", "max_steps": 1}
@@ -110,6 +120,28 @@ def test_a_strategy_whose_results_end_with_its_processes_is_refused(
         make_trainer(settings, [])
 
 
+@pytest.mark.parametrize(
+    ("code", "how"),
+    [
+        ("import sys; sys.exit(1)", "exit status 1"),
+        ("import os; os.kill(os.getpid(), 9)", "signal 9"),
+    ],
+)
+def test_another_process_that_fails_after_the_training_is_told(code: str, how: str) -> None:
+    """The first has its results by then, and would end with status 0."""
+    others = [subprocess.Popen([sys.executable, "-c", one]) for one in ("", code)]
+    with pytest.raises(ProblemsFound, match=rf"^process 2 of this training ended .*{how}, .*"):
+        check_others(others)
+    check_others(others[:1])
+
+
+def test_another_process_that_is_still_at_its_test_is_left_alone() -> None:
+    with subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE) as late:
+        check_others([late], wait=0.1)
+        assert late.poll() is None
+        late.communicate(b"\n")
+
+
 def test_no_results_are_written_of_no_image() -> None:
     job = Job(OmegaConf.create({}), {}, [], Path(), "train", False)
     with pytest.raises(UserError, match=r"^no image was tested"):
@@ -121,6 +153,19 @@ def test_no_results_are_written_of_no_image() -> None:
 def test_a_precision_that_blurs_poses_is_refused(precision: str) -> None:
     with pytest.raises(UserError, match=rf"trainer\.precision={precision}: .*32-true"):
         make_trainer(OmegaConf.create({**SETTINGS, "precision": precision}), [])
+
+
+def test_a_precision_that_there_is_not_is_told_from_one_that_blurs_poses() -> None:
+    """Lightning's own lists say which there are."""
+    lists = _PRECISION_INPUT_INT, _PRECISION_INPUT_STR, _PRECISION_INPUT_STR_ALIAS
+    for there in (one for names in lists for one in get_args(names)):
+        if str(there) not in ("32", "32-true"):
+            with pytest.raises(UserError, match=rf"^trainer\.precision={there}: half precision"):
+                check_precision(there)
+    for absent in (17, "double", "32-mixed"):
+        told = rf"^trainer\.precision={absent}: Lightning has none of this name; .*32-true"
+        with pytest.raises(UserError, match=told):
+            check_precision(absent)
 
 
 def test_a_callback_that_may_not_be_built_is_told_which_may() -> None:

@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 from dataset_trees import bop_scene, fat_folder, fat_frame, fat_tree, pose, write_mesh
 
+from posefilter.cli.command import compose_job
+from posefilter.cli.track import open_videos
 from posefilter.data.readers.bop import BopReader
 from posefilter.data.readers.fat import FatReader
 from posefilter.data.readers.registry import open_whole
@@ -13,6 +15,7 @@ from posefilter.data.sequences import SceneVideo, list_scenes
 from posefilter.errors import BadData, UserError
 from posefilter.meshes.store import MeshStore
 
+CONF = Path(__file__).parents[2] / "conf"
 EYES = ("left", "right")
 NEAR, FAR = pose(), pose((0.1, 0.2, 0.3), (0.02, 0.01, 0.6))
 
@@ -64,6 +67,16 @@ def test_a_bop_dataset_of_ycb_objects_is_called_as_the_objects_that_are_asked_fo
     assert set(frame.truth) == {name}
     own = open_whole("bop", tmp_path / "data", ["obj_000005"], meshes, mesh_frame=None)
     assert own.objects == ("obj_000002", "obj_000005")
+
+
+def test_objects_that_a_dataset_does_not_show_are_told_with_its_own(tmp_path: Path) -> None:
+    bop_scene(tmp_path / "data" / "000048", [[(5, NEAR), (2, FAR)]])
+    write_mesh(tmp_path / "meshes", "drill")
+    places = [f"data.root={tmp_path / 'data'}", f"data.meshes={tmp_path / 'meshes'}"]
+    cfg = compose_job("track", CONF, ["data=bop", *places], tmp_path).cfg
+    told = r"^data\.root=.* \(drill\); its own are obj_000002, obj_000005$"
+    with pytest.raises(UserError, match=told):
+        open_videos(cfg, ["drill"])
 
 
 def test_an_object_of_no_known_frame_ends_no_track_of_another(tmp_path: Path) -> None:

@@ -4,6 +4,7 @@ one.
 
 from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -16,7 +17,7 @@ from posefilter.cli.command import compose_job
 from posefilter.cli.plain import to_plain
 from posefilter.errors import UserError
 from posefilter.models.base import PoseEstimator
-from posefilter.models.lr_schedulers import warmup_cosine
+from posefilter.models.lr_schedulers import check_length, warmup_cosine
 from posefilter.ranges import check_ranges
 
 CONF = Path(__file__).parents[2] / "conf"
@@ -98,6 +99,23 @@ def test_adafactor_takes_the_methods_weights() -> None:
 def test_a_length_that_is_set_is_kept() -> None:
     name = "torch.optim.lr_scheduler.CosineAnnealingLR"
     assert schedule(_target_=name, _partial_=True, T_max=9).T_max == 9
+
+
+@pytest.mark.parametrize("name", TORCH)
+def test_a_training_that_goes_on_for_longer_than_its_schedule_is_refused(name: str) -> None:
+    """A checkpoint brings the schedule's length: torch's would end in an error, or rise again."""
+    node = {"_target_": f"torch.optim.lr_scheduler.{name}", "_partial_": True, **TORCH[name]}
+    made, make = schedule(**node), build(**node).make_scheduler
+    assert make is not None
+    for steps in (STEPS - 1, STEPS):
+        check_length(make, made, SimpleNamespace(estimated_stepping_batches=steps))
+    longer = SimpleNamespace(estimated_stepping_batches=STEPS + 1, max_steps=STEPS + 1)
+    if name in LENGTH:
+        told = rf"^trainer\.max_steps=41: .*{name}, ends after 40, .* warm_start="
+        with pytest.raises(UserError, match=told):
+            check_length(make, made, longer)
+    else:
+        check_length(make, made, longer)
 
 
 def test_the_projects_own_takes_the_trainings_steps() -> None:

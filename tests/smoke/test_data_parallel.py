@@ -46,6 +46,31 @@ def test_two_processes_train_one_method(tmp_path: Path, tiny_scenes: Path, insta
 
 
 @pytest.mark.slow
+def test_a_process_that_fails_in_the_test_fails_the_command(
+    tmp_path: Path, tiny_scenes: Path
+) -> None:
+    """The first has tested by then, and its results are kept."""
+    (tmp_path / "own_callbacks.py").write_text(
+        "from lightning import Callback\n\n\n"
+        "class Failing(Callback):\n"
+        "    def on_test_end(self, trainer, method):\n"
+        "        if trainer.global_rank == 1:\n"
+        "            raise ValueError('here')\n"
+    )
+    more = "plugins=[own_callbacks]", "+callbacks.failing._target_=own_callbacks.Failing"
+    words, clean = command(tiny_scenes, tmp_path / "run", 2, *more)
+    path = os.pathsep.join([str(tmp_path), os.environ.get("PYTHONPATH", "")])
+    done = subprocess.run(
+        words, capture_output=True, text=True, timeout=600, cwd=tmp_path,
+        env=clean | {"PYTHONPATH": path},
+    )  # fmt: skip
+    assert done.returncode == 1, done.stderr
+    told = "train: process 1 of this training ended with exit status 1"
+    assert any(line.startswith(told) for line in done.stderr.splitlines())
+    assert json.loads((tmp_path / "run" / "metrics.json").read_text())["training"]["steps"] == 2
+
+
+@pytest.mark.slow
 def test_only_the_first_process_draws(tmp_path: Path, tiny_scenes: Path) -> None:
     """The others have no event file to draw into."""
     out = tmp_path / "run"

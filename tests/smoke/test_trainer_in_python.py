@@ -2,6 +2,7 @@
 
 import pickle
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -91,6 +92,42 @@ def test_a_method_that_detects_is_read_back(pair: Callable[[str], Pair], tmp_pat
     trainer = make_trainer(tmp_path / "more", max_steps=2, limit_val_batches=1)
     trainer.fit(again.train(), data, ckpt_path=file, weights_only=True)
     assert trainer.global_step == 2
+
+
+def test_what_was_trained_with_a_compiled_network_is_read_back(
+    pair: Callable[[str], Pair], tmp_path: Path
+) -> None:
+    """`torch.compile` has the names of its weights in the checkpoint begin with another."""
+    method, data = pair("cnn_patch")
+    plain = {*method.state_dict()}
+    method.encoder = torch.compile(method.encoder, backend="eager")
+    trainer = make_trainer(tmp_path, max_steps=1, limit_val_batches=0)
+    trainer.fit(method, data)
+    trainer.save_checkpoint(tmp_path / "own.ckpt", weights_only=False)
+    assert {*method.state_dict()} != plain
+    again = posefilter.load_method(tmp_path / "own.ckpt").state_dict()
+    assert {*again} == plain
+    for key, value in method.state_dict().items():
+        assert torch.equal(value, again[key.replace("_orig_mod.", "")])
+
+
+def test_a_fit_that_goes_on_for_longer_than_its_schedule_is_refused(
+    pair: Callable[[str], Pair], tmp_path: Path
+) -> None:
+    method, data = pair("cnn_patch")
+    method.make_scheduler = partial(torch.optim.lr_scheduler.OneCycleLR, max_lr=1e-3)
+    trainer = make_trainer(tmp_path, max_steps=2, limit_val_batches=0)
+    trainer.fit(method, data)
+    file = tmp_path / "own.ckpt"
+    trainer.save_checkpoint(file, weights_only=False)
+
+    def go_on(steps: int) -> None:
+        again = make_trainer(tmp_path / "more", max_steps=steps, limit_val_batches=0)
+        again.fit(method, data, ckpt_path=file, weights_only=True)
+
+    go_on(2)
+    with pytest.raises(posefilter.UserError, match=r"^trainer\.max_steps=3: .* ends after 2, "):
+        go_on(3)
 
 
 @pytest.mark.parametrize("precision", ["bf16-mixed", "64-true"])

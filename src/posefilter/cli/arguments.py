@@ -232,12 +232,15 @@ def defer_settings(arguments: Sequence[str], conf: Path) -> list[str]:
 
 
 def name_places(arguments: Sequence[str]) -> list[str]:
-    """Return the command line with its first two bare words as `bag=` and `out=`."""
+    """Return the command line with its first two bare words as `bag=` and `out=`; values of Hydra's
+    options are none.
+    """
     names = iter(("bag", "out"))
     out = []
-    for argument in arguments:
+    for before, argument in pairwise(["", *arguments]):
         sign = argument.startswith(("-", "~", "+")) and not argument.startswith("~/")
-        bare = "=" not in argument and not sign
+        is_value = before in _VALUED or (before in _INFO and argument in _KINDS)
+        bare = "=" not in argument and not sign and not is_value
         key = next(names, None) if bare else None
         out.append(argument if key is None else f"{key}={argument}")
     return out

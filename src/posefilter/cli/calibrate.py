@@ -18,7 +18,7 @@ from posefilter.cli.build import build_data
 from posefilter.cli.checkpoints import find_checkpoint, method_of, read_checkpoint
 from posefilter.cli.components import changes
 from posefilter.cli.console import JSON, ended, say, show_table, typed, typed_prediction
-from posefilter.cli.evaluate import data_settings
+from posefilter.cli.evaluate import check_own_folders, data_settings
 from posefilter.cli.files import save_whole
 from posefilter.cli.job import Job
 from posefilter.cli.learned import warn_of_learned
@@ -97,6 +97,7 @@ def calibrate(job: Job) -> None:
         )
     method.to(choose_device()).seed = cfg.seed
     settings = data_settings(job, checkpoint["recipe"]["settings"], name, "val")
+    check_own_folders(settings, job)
     settings.limit_val = cfg.frames
     data = build_data(settings, cfg.console, job.overrides)
     data.setup("validate")

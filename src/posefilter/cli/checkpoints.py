@@ -9,6 +9,7 @@ from typing import Any
 import torch
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
+from torch import Tensor
 
 from posefilter.cli.archive import Bounded, check_archive, check_content
 from posefilter.cli.components import changed
@@ -27,6 +28,7 @@ from posefilter.ranges import check_ranges
 from posefilter.types import ObjectModel
 from posefilter.weights import expand_weights, find_weights
 
+_COMPILED = "_orig_mod."  # in the names of weights of what `torch.compile` returned
 _SPARE_ELEMENTS, _SPARE_TENSORS = 1 << 24, 20_000  # that a method may make beside its weights
 
 
@@ -154,6 +156,7 @@ def method_of(
     except Exception as error:  # settings that do not fit each other break in any component
         why = f"{type(error).__name__}: {find_reason(error)[:200]}"
         raise UserError(f"checkpoint: its recipe describes no method ({why})") from error
+    state = _name_alike(state, method)
     try:
         missing, foreign = method.load_state_dict(state, strict=False)
     except RuntimeError as error:  # tensors of other shapes
@@ -179,6 +182,14 @@ def method_of(
         else:
             method.calibration_note = "the checkpoint was calibrated for another filter"
     return method.eval()
+
+
+def _name_alike(state: dict[str, Tensor], method: PoseEstimator) -> dict[str, Tensor]:
+    """Return weights by the names that they have in a method: `torch.compile` of a network adds
+    `_orig_mod.` to those of its weights, and here or there it may be compiled.
+    """
+    own = {key.replace(_COMPILED, ""): key for key in method.state_dict()}
+    return {own.get(key.replace(_COMPILED, ""), key): value for key, value in state.items()}
 
 
 def is_calibrated_filter(settings: dict[str, Any], calibrated: dict[str, Any]) -> bool:

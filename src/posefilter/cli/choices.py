@@ -169,7 +169,7 @@ def check_preset(name: str, folders: Sequence[Path]) -> None:
 def say_no_choice(group: str, name: str, known: Sequence[str]) -> str:
     """Return that a group has no choice of a name, which is the nearest, and which it has."""
     near = hint(name, known).rstrip("?")
-    own = "" if named() else "; one of your own needs plugins=[PACKAGE]"
+    own = "" if named() else "; one of your own needs plugins=[PACKAGE] or --config-dir DIR"
     return f"{group}={name}: there is no such choice{near}; there are {', '.join(known)}{own}"
 
 

@@ -135,7 +135,8 @@ def run_command(name: str, home: Path | None = None, arguments: list[str] | None
         return 128 + stopped.number
     except (Carrier, *EXPECTED) as caught:
         error = caught.args[0] if isinstance(caught, Carrier) else caught
-        write_record(record)
+        if not isinstance(error, ProblemsFound):  # else the work is done, with these settings
+            write_record(record)
         if trace:
             traceback.print_exception(error)
         print(f"{name}: {explain(error, name, conf, arguments)}", file=sys.stderr)

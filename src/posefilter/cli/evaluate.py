@@ -25,7 +25,7 @@ from posefilter.cli.learned import warn_of_learned
 from posefilter.cli.machine import settle
 from posefilter.cli.plain import key_of, to_plain
 from posefilter.cli.progress_bar import progress
-from posefilter.cli.recipe import check_data
+from posefilter.cli.recipe import check_data, no_own_folder
 from posefilter.cli.results import record, show, write_json
 from posefilter.confidence.tolerance import RIGHT, read_pose_tolerance
 from posefilter.data.absent import hide_annotation
@@ -103,6 +103,7 @@ def _of_checkpoint(job: Job) -> tuple[dict[str, Any], dict[str, Path]]:
         method.calibration.fit_success(method.pose_tolerance)  # refused before anything is tested
     check_links(job.folder)
     settings = data_settings(job, checkpoint["recipe"]["settings"], method.object_model.name)
+    check_own_folders(settings, job)
     data = build_data(settings, job.cfg.console, job.overrides)
     data.setup("test")
     judge_by(method, object_to_judge(data, method.object_model))
@@ -376,6 +377,27 @@ def data_settings(
     if data.get("generate") and not any(key.startswith("generate") for key in typed):
         data.generate = None  # a mistyped folder must not be filled with a new dataset
     return data
+
+
+def check_own_folders(data: DictConfig, job: Job) -> None:
+    """Raise UserError where a checkpoint's own dataset or meshes are not there: their folders may
+    be relative to the one in which it was trained.
+
+    Args:
+        data: What `data_settings` returns.
+        job: Folders that are typed, or of a dataset that is chosen by `data=`, are not looked at.
+    """
+    keys = {key_of(one).removeprefix("data.") for one in job.overrides}
+    given = job.cfg.get("data") or {}
+    if "_target_" in given:
+        return
+    rendered = any(key.startswith("generate") for key in keys)
+    for key in ("meshes",) if rendered else ("root", "meshes"):
+        folder = data.get(key)
+        if key in keys or not isinstance(folder, str) or folder == "builtin":
+            continue
+        if not Path(folder).is_dir():
+            raise UserError(no_own_folder(key, folder))
 
 
 def _is_of_split(key: str) -> bool:

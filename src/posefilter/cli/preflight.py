@@ -12,7 +12,7 @@ from posefilter.cli.choices import read_settings
 from posefilter.cli.plain import find, unresolved
 from posefilter.errors import UserError, missing_package
 from posefilter.paths import find_conf
-from posefilter.weights import expand_weights, find_weights, is_several
+from posefilter.weights import ALL, expand_weights, find_weights, is_several
 
 # by command: settings that name a file to be read
 _FILES = {"predict": ("rgb", "depth"), "evaluate": ("estimates",)}
@@ -75,6 +75,7 @@ def check_files(command: str, cfg: DictConfig) -> None:
     if command == "train":
         _check_loggers(cfg.get("logger"))
     if command in ("export", "calibrate") or (command == "evaluate" and cfg.checkpoint):
+        _check_single(command, cfg.checkpoint)
         find_weights(cfg.checkpoint)
     if command in ("train", "onboard") and cfg.warm_start and not cfg.get("resume"):
         try:
@@ -211,6 +212,14 @@ def _take_as_text(cfg: DictConfig, key: str) -> None:
         OmegaConf.update(cfg, key, str(value))
     elif not isinstance(value, str | None):
         raise UserError(f"{TYPED.get(key, key)}={value}: must be the name of a file or folder")
+
+
+def _check_single(command: str, weights: Any) -> None:
+    """Raise UserError where a command that takes one checkpoint is given a list of them."""
+    if is_several(weights) and (weights == ALL or not isinstance(weights, str)):
+        typed = weights if isinstance(weights, str) else f"[{','.join(map(str, weights))}]"
+        sweep = ", in a sweep: -m checkpoint=A,B" if command == "evaluate" else ""
+        raise UserError(f"checkpoint={typed}: {command} takes one; give them one by one{sweep}")
 
 
 def _find_all(weights: Any) -> None:

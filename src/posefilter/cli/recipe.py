@@ -134,9 +134,11 @@ def check_data(data: Mapping[str, Any], typed: Mapping[str, Any]) -> None:
         if not isinstance(value, str) or key in typed or value in own or key.endswith("_target_"):
             continue
         place = key in ("root", "cache_dir") or key.endswith("out")
-        if not stays_inside(value, Path()) or (
-            place and not (Path("outputs") in Path(value).parents or Path(value).is_dir())
-        ):
+        absent = place and not (Path("outputs") in Path(value).parents or Path(value).is_dir())
+        inside = stays_inside(value, Path())
+        if absent and inside and key == "root":
+            raise UserError(no_own_folder(key, value))
+        if absent or not inside:
             raise UserError(
                 f"data.{key}={value}: a checkpoint decides on no such place; if it is right, type "
                 f"data.{key}={value}"
@@ -146,6 +148,20 @@ def check_data(data: Mapping[str, Any], typed: Mapping[str, Any]) -> None:
             "data.cache=disk: a checkpoint does not decide where frames are kept; type "
             "data.cache=disk or memory"
         )
+
+
+def no_own_folder(key: str, folder: str) -> str:
+    """Return the line on a folder of a checkpoint's own data that is not there.
+
+    Args:
+        key: `root` or `meshes`.
+        folder: What the checkpoint says.
+    """
+    relative = ", relative to where it was trained" if not Path(folder).is_absolute() else ""
+    return (
+        f"data.{key}={folder}: no such folder here; it is the checkpoint's own{relative}: type "
+        f"data.{key}=DIR, or choose another dataset, data=... data.root=DIR"
+    )
 
 
 def _check_value(path: str, value: Any) -> None:

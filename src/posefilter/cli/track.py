@@ -277,8 +277,10 @@ def open_videos(cfg: DictConfig, objects: Sequence[str]) -> tuple[Sequence[Video
     videos = [SceneVideo(reader, one, names, cfg.stride) for one in scenes]
     shown = [video for video in videos if video.objects]
     if not shown:
+        there = ", ".join(reader.objects[:5]) + (", ..." if len(reader.objects) > 5 else "")
         raise UserError(
-            f"data.root={data.root}: none of the objects is annotated there ({', '.join(names)})"
+            f"data.root={data.root}: none of the objects is annotated there ({', '.join(names)}); "
+            f"its own are {there}"
         )
     return shown, reader.native_from_mesh
 

@@ -25,7 +25,7 @@ from posefilter.cli.job import Job
 from posefilter.cli.learned import DATA, list_learned
 from posefilter.cli.machine import settle
 from posefilter.cli.progress_bar import count_steps
-from posefilter.cli.ranks import is_follower
+from posefilter.cli.ranks import check_others, is_follower
 from posefilter.cli.recipe import check_recipe
 from posefilter.cli.results import record, show, write_json
 from posefilter.cli.resume import LAST, list_unkept
@@ -71,6 +71,7 @@ def train(job: Job) -> float:
         tested_at = read_trained(checkpoint)
         training |= {"tested_step": tested_at.step}
         metrics = finish(run, training, test(run, checkpoint, tested_at))
+        check_others(getattr(run.trainer.strategy.launcher, "procs", ()))
     return compute_checkpoint_score(metrics)
 
 

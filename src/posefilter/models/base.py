@@ -37,7 +37,7 @@ from posefilter.metrics.results import compute_checkpoint_score, flatten, to_num
 from posefilter.models import evaluation
 from posefilter.models.box_heads import PoseBox
 from posefilter.models.clipping import SubmoduleClipper
-from posefilter.models.lr_schedulers import find_length, start_schedule
+from posefilter.models.lr_schedulers import check_length, find_length, start_schedule
 from posefilter.models.quantization import unpack_object
 from posefilter.models.zoom import check_zoom, choose_part, search
 from posefilter.nets import folded, fused
@@ -348,6 +348,11 @@ class PoseEstimator(Module):
     def setup(self, stage: str) -> None:
         """Refuse a trainer of another precision, before anything is computed."""
         check_precision(self.trainer.precision)
+
+    def on_train_start(self) -> None:
+        """Refuse to go on for longer than the schedule that a checkpoint brings."""
+        if self.make_scheduler is not None:
+            check_length(self.make_scheduler, self.lr_schedulers(), self.trainer)
 
     def training_step(self, batch: Batch, batch_number: int) -> Tensor:
         """Return the sum of the losses' means, the loss that is minimized.

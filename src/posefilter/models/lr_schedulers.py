@@ -57,6 +57,30 @@ def start_schedule(make: Callable[..., LRScheduler], optimizer: Optimizer, train
     return make(optimizer, **{length: int(steps)})
 
 
+def check_length(make: Callable[..., Any], schedule: Any, trainer: Any) -> None:
+    """Check that a schedule goes on to the end of a training: a checkpoint brings its length, too.
+
+    Beyond it torch's `OneCycleLR` ends in an error, and `CosineAnnealingLR` rises again.
+
+    Args:
+        make: What the schedule was made by.
+        schedule: It, with the state that the training goes on from.
+        trainer: Of the training.
+
+    Raises:
+        UserError: The training goes on for more steps.
+    """
+    length = find_length(make)
+    kept = getattr(schedule, length, None) if length is not None else None
+    steps = trainer.estimated_stepping_batches
+    if isinstance(kept, int) and kept < steps:
+        raise UserError(
+            f"trainer.max_steps={trainer.max_steps}: the training goes on for {steps} steps, and "
+            f"its schedule of the learning rate, {type(schedule).__name__}, ends after {kept}, "
+            "with which it began; leave it at that, or begin a new run, warm_start=CHECKPOINT"
+        )
+
+
 def warmup_cosine(
     optimizer: Optimizer, steps: int, warmup_steps: int = 200, min_lr_fraction: float = 0.01
 ) -> LambdaLR:
