@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from posefilter.errors import UserError
+from posefilter.errors import UserError, printable
 
 MOST = 1e30  # of a number: beyond, sums and charts end in infinity
 
@@ -71,7 +71,8 @@ def check_form(value: Any, form: Any, path: Path, place: str = "") -> None:
             if needed and name not in value:
                 raise UserError(f"{its} has no {name}")
             if not isinstance(form, dict) or value.get(name) is not None:
-                check_form(value[name], own, path, f"{place}.{name}".lstrip("."))
+                within = f"{place}.{printable(str(name))}".lstrip(".")
+                check_form(value[name], own, path, within)
 
 
 def _whole(text: str) -> int:

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from posefilter import limits
-from posefilter.errors import UserError
+from posefilter.errors import UserError, printable
 from posefilter.forms import NUMBER, TEXT, Each, Record, check_form, parse_json
 from posefilter.metrics.image_errors import FILE, ImageError
 from posefilter.report.events import (
@@ -153,7 +153,8 @@ def read_metrics(path: Path) -> dict[str, Any]:
     ends = r"\d+(\.\d+)?"
     for name in metrics.get("by_visibility") or {}:
         if not re.fullmatch(f"{ends}-{ends}", name):
-            raise UserError(f"{path}: its by_visibility should have ranges, as 0.3-0.5: {name:.40}")
+            said = f"its by_visibility should have ranges, as 0.3-0.5: {printable(name[:40])}"
+            raise UserError(f"{path}: {said}")
     found = metrics.get("credibility") or {}
     curves = [found.get("all"), *(one["coverage"] for one in found.get("quarters") or ())]
     levels = found.get("levels")
