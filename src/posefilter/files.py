@@ -124,11 +124,15 @@ def remove_parts(folder: Path, places: Sequence[str], seconds: float = 0.0) -> N
 
     Args:
         folder: A folder in which nobody writes now; or `seconds` must say what is old.
-        places: Patterns of the folders in it that are looked at, "." for itself.
+        places: Patterns of the folders in it that are looked at, "." for itself. One that is a link
+            out of it is not: a folder of somebody else may have such links.
         seconds: Only what is older.
     """
+    home = os.path.realpath(folder)
     for place, name in product(places, _PARTS):
         for part in folder.glob(f"{place}/{name}"):
+            if os.path.commonpath([os.path.realpath(part.parent), home]) != home:
+                continue
             with suppress(OSError):  # of another user, or gone by now
                 if time.time() - part.lstat().st_mtime >= seconds:
                     part.unlink()

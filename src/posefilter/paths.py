@@ -78,7 +78,8 @@ def check_links(folder: Path) -> None:
             path = Path(place, name)
             if path.is_symlink() and os.path.commonpath([os.path.realpath(path), home]) != home:
                 raise UserError(
-                    f"{path}: is a link that leads out of its run's folder; remove it, or give out="
+                    f"{path}: is a link that leads out of {folder}, and what is written would go "
+                    "elsewhere; remove it, or give another out="
                 )
 
 
