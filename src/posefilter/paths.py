@@ -70,8 +70,13 @@ def check_inside(path: Path, root: Path) -> Path:
     return path
 
 
-def check_links(folder: Path) -> None:
-    """Raise UserError where a link leads out of a folder: what is written would go elsewhere."""
+def check_links(folder: Path, instead: str = "give another out=") -> None:
+    """Raise UserError where a link leads out of a folder: what is written would go elsewhere.
+
+    Args:
+        folder: The folder; it need not be there.
+        instead: What to do where the link is to stay, for messages.
+    """
     home = os.path.realpath(folder)
     for place, folders, files in os.walk(folder):
         for name in (*folders, *files):
@@ -79,7 +84,7 @@ def check_links(folder: Path) -> None:
             if path.is_symlink() and os.path.commonpath([os.path.realpath(path), home]) != home:
                 raise UserError(
                     f"{path}: is a link that leads out of {folder}, and what is written would go "
-                    "elsewhere; remove it, or give another out="
+                    f"elsewhere; remove it, or {instead}"
                 )
 
 

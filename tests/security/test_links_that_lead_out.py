@@ -10,6 +10,7 @@ import pytest
 import torch
 
 from posefilter.cli.command import run_command
+from posefilter.data.cache import DiskCache
 from posefilter.errors import UserError
 from posefilter.files import remove_parts
 from posefilter.synthetic.generate import generate
@@ -108,4 +109,16 @@ def test_an_onboarding_of_links_is_not_gone_on_with(
         (out / name).symlink_to(tmp_path / "outside")
     assert run_command("onboard", HOME, ["mesh=carton", f"out={out}", "console=json"]) == 2
     assert f"is a link that leads out of {out}" in capfd.readouterr().err
+    check_kept(kept)
+
+
+@pytest.mark.parametrize("what", ["README", "00", ""])
+def test_a_cache_that_a_dataset_brings_leads_nowhere(what: str, tmp_path: Path) -> None:
+    kept = fill(tmp_path / "outside")
+    folder = tmp_path / "data" / ".cache" / DiskCache(tmp_path / "own", "x").folder.name
+    (folder / what).parent.mkdir(parents=True)
+    (folder / what).symlink_to(tmp_path / "outside" / ("file.txt" if what == "README" else ""))
+    with pytest.raises(UserError, match="leads out of") as caught:
+        DiskCache(tmp_path / "data" / ".cache", "x")
+    assert "\n" not in str(caught.value)
     check_kept(kept)
