@@ -19,6 +19,8 @@ MOST_SCANS = 100  # of a JPEG: encoders write up to 20, and each goes through al
 FEWEST_KNOWN = 0.001  # share of an image's pixels with depth, below which it cannot be judged
 MOST_BYTES = 1 << 29  # of an image's or JSON's file
 _MARKER = re.compile(rb"\xff([^\x00\x01\xd0-\xd8\xff])")  # of a JPEG, that has a length or ends it
+_FORMATS = ("PNG", "JPEG", "GIF", "BMP", "PPM")  # that PIL knows before it looks for more
+_RARE_FORMATS = ("TIFF", "WEBP", "JPEG2000", "AVIF", "SUN")
 _OTHERS = {  # by what files begin with, that are named for images
     b"\x93NUMPY": "it is an array: end its name in .npy",
     b"PK\x03\x04": "it is an archive, as .npz is: save the array by np.save",
@@ -159,6 +161,19 @@ class PlainLoader(yaml.SafeLoader):
 PlainLoader.add_constructor("tag:yaml.org,2002:opencv-matrix", PlainLoader.construct_yaml_map)
 
 
+def open_picture(data: bytes) -> Image.Image:
+    """Open a picture of a format that pictures have, whatever its file is called.
+
+    Raises UnidentifiedImageError for others: PIL would start Ghostscript, a program, for EPS.
+    """
+    try:
+        return Image.open(io.BytesIO(data), formats=_FORMATS)
+    except UnidentifiedImageError:
+        Image.init()
+        others = [kind for kind in _RARE_FORMATS if kind in Image.OPEN]  # AVIF: not in older PIL
+        return Image.open(io.BytesIO(data), formats=others)
+
+
 def check_picture(path: Path, data: bytes) -> int:
     """Return the number of an image's pixels.
 
@@ -168,7 +183,7 @@ def check_picture(path: Path, data: bytes) -> int:
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            with Image.open(io.BytesIO(data)) as image:
+            with open_picture(data) as image:
                 width, height = image.size
     except Image.DecompressionBombError as error:
         raise BadData(path, "image too large", str(error)) from error
