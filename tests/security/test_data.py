@@ -338,9 +338,13 @@ BOMB = "a: &a [x, x]\n" + "".join(
      ("a: !!opencv-matrix [1]", "is no YAML"), ("a: !!opencv-matrix {" * 5_000, "is no YAML"),
      ("a: !!opencv-matrix {data: !!python/name:os.system }", "is no YAML"),
      ("%YAML:1.0\n---\na: &a !!opencv-matrix {data: *a}", "alias"),
-     ("a: 1\n---\n" + BOMB, "alias")],
+     ("a: 1\n---\n" + BOMB, "alias"),
+     ("a: " + ":".join(["1"] * 60_000), "a number of"),
+     ("a: 1:" + ":".join(["1"] * 60_000) + ".5", "a number of"),
+     *((f"a: {value}", "is no YAML") for value in ("!!int ''", "!!bool x", "!!timestamp x"))],
     ids=["alias bomb", "loop", "function", "large", "deep", "matrix of a list", "deep matrix",
-         "matrix of a function", "matrix in a loop", "bomb in a second document"],
+         "matrix of a function", "matrix in a loop", "bomb in a second document",
+         "base of 60", "fraction to the base of 60", "no number", "no truth", "no time"],
 )  # fmt: skip
 def test_a_runs_settings_are_plain(text: str, told: str, tmp_path: Path, watch: Any) -> None:
     (tmp_path / ".hydra").mkdir()

@@ -11,7 +11,7 @@ from posefilter.data.readers.decode import numbers, read_array, whole_number
 from posefilter.errors import BadData
 from posefilter.limits import read_json, read_lines, read_yaml
 
-_LARGEST = 1 << 24  # bytes
+_LARGEST = 1 << 24  # bytes of JSON
 _PAIRS = (("cx", "cy"), ("ppx", "ppy"))  # of the principal point
 _MATRICES = ("camera_matrix", "intrinsic_matrix", "cam_K", "K", "k")
 # that of the color image first: depth is aligned to it
@@ -55,7 +55,7 @@ def read_camera_file(path: Path) -> CameraFile:
     """
     ending = path.suffix.lower()
     if ending in (".yaml", ".yml"):
-        return _of_mapping(read_yaml(path, _LARGEST), path)
+        return _of_mapping(read_yaml(path), path)
     if ending == ".json":
         return _of_mapping(read_json(path, _LARGEST), path)
     words: Any

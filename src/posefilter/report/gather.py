@@ -22,7 +22,7 @@ from posefilter.report.image_errors import read_image_errors
 from posefilter.report.images import StoredImage, read_images
 
 MARKS = ("metrics.json", ".hydra/config.yaml")
-_MOST_YAML, _MOST_JSON = 1 << 20, 1 << 26  # [bytes]
+_MOST_JSON = 1 << 26  # [bytes]
 SWEEP_MARKS = ("multirun.yaml", "summary.csv")
 _NO_ERRORS = "No errors.csv: what the test found in single images is not known."
 
@@ -212,7 +212,7 @@ def read_yaml(path: Path) -> dict[str, Any]:
     """
     if not path.is_file():
         return {}
-    content = limits.read_yaml(path, _MOST_YAML)
+    content = limits.read_yaml(path)
     if not isinstance(content, dict):
         raise UserError(f"{path}: should hold one mapping")
     return content
