@@ -5,7 +5,9 @@ import unicodedata
 from functools import lru_cache
 from pathlib import Path, PureWindowsPath
 
-from posefilter.errors import UserError
+from posefilter.errors import UserError, printable
+
+_FORMULAS = ("=", "+", "-", "@")  # what begins so a spreadsheet computes
 
 
 def find_conf() -> Path:
@@ -27,9 +29,16 @@ def is_plain_name(name: str) -> bool:
         and name.isprintable()
         and len(name.encode()) <= 200
         and name == name.strip()
-        and not same.startswith((".", "~", "=", "+", "-", "@"))
+        and not same.startswith((".", "~", *_FORMULAS))
         and not set(same) & set("/\\:")
     )
+
+
+def name_in_table(name: str) -> str:
+    """Return a file's name as a table has it: as it is, but for what a terminal would obey, and a
+    `./` ahead of what a spreadsheet would take for a formula.
+    """
+    return f"./{printable(name)}" if name.startswith(_FORMULAS) else printable(name)
 
 
 def stays_inside(path: str, folder: Path) -> bool:
