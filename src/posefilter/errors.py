@@ -1,6 +1,7 @@
 """What stands for a user's mistake, which a command tells in a line, and for a wish to stop."""
 
 import math
+import unicodedata
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from numbers import Integral, Real
@@ -11,11 +12,33 @@ from typing import Any
 MISTAKE, FAILURE, INTERRUPTED = 2, 1, 130  # exit statuses
 
 
+def printable(text: str) -> str:
+    """Return a text, such as a name in a file of others, with what a terminal would obey rather
+    than show as numbers: `\\x1b`, `\\n`, `\\u202e`. Blanks of other scripts stay.
+    """
+    if text.isprintable():
+        return text
+    shown = (one.isprintable() or unicodedata.category(one) == "Zs" for one in text)
+    return "".join(
+        one if plain else one.encode("unicode_escape").decode()
+        for one, plain in zip(text, shown, strict=True)
+    )
+
+
+def printable_lines(text: str) -> str:
+    """Return a text as `printable` does, with the ends of its lines as they are."""
+    return "\n".join(map(printable, text.split("\n")))
+
+
 class UserError(Exception):
     """A mistake in data, configuration or arguments.
 
-    The message is one line: which file or key, and the likely cause.
+    The message is one line: which file or key, and the likely cause. It holds nothing that a
+    terminal obeys: names in files of others are quoted.
     """
+
+    def __str__(self) -> str:
+        return printable_lines(super().__str__())
 
 
 def find_reason(error: BaseException) -> str:
@@ -97,7 +120,7 @@ class BadData(UserError):  # noqa: N818
         self.path, self.cause, self.detail = path, cause, detail
 
     def __str__(self) -> str:
-        return f"{self.path}: {self.cause}" + (f" ({self.detail})" if self.detail else "")
+        return printable(f"{self.path}: {self.cause}" + f" ({self.detail})" * bool(self.detail))
 
 
 class Carrier(BaseException):

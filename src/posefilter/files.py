@@ -16,6 +16,7 @@ from typing import BinaryIO, TextIO
 from posefilter.errors import UserError
 
 _PARTS = (".*.part", ".*.part.mp4")  # a video's ending tells its encoder the format
+_UNKNOWN = "backslashreplace"
 _SYNC_EVERY = 1.0  # of a file that grows [s]
 
 
@@ -58,18 +59,20 @@ def open_whole(path: Path, sync: bool = True) -> Iterator[BinaryIO]:
 
 @contextmanager
 def open_whole_text(path: Path) -> Iterator[TextIO]:
-    """Open a text for writing, in UTF-8, its line ends as they are written; as `open_whole`."""
+    """Open a text for writing, in UTF-8, its line ends as they are written; as `open_whole`. What
+    is not in UTF-8, as in names of files, is written by its number.
+    """
     with open_whole(path) as file:
-        text = io.TextIOWrapper(file, encoding="utf-8", newline="")
+        text = io.TextIOWrapper(file, encoding="utf-8", errors=_UNKNOWN, newline="")
         yield text
         text.flush()
         text.detach()
 
 
 def write_whole(path: Path, content: bytes | memoryview | str, sync: bool = False) -> None:
-    """Write a file, all of it or nothing; as `open_whole`."""
+    """Write a file, all of it or nothing; as `open_whole`, a text as `open_whole_text`."""
     with open_whole(path, sync) as file:
-        file.write(content.encode() if isinstance(content, str) else content)
+        file.write(content.encode(errors=_UNKNOWN) if isinstance(content, str) else content)
 
 
 class GrowingFile:
@@ -124,11 +127,15 @@ def remove_parts(folder: Path, places: Sequence[str], seconds: float = 0.0) -> N
 
     Args:
         folder: A folder in which nobody writes now; or `seconds` must say what is old.
-        places: Patterns of the folders in it that are looked at, "." for itself.
+        places: Patterns of the folders in it that are looked at, "." for itself. One that is a link
+            out of it is not: a folder of somebody else may have such links.
         seconds: Only what is older.
     """
+    home = os.path.realpath(folder)
     for place, name in product(places, _PARTS):
         for part in folder.glob(f"{place}/{name}"):
+            if os.path.commonpath([os.path.realpath(part.parent), home]) != home:
+                continue
             with suppress(OSError):  # of another user, or gone by now
                 if time.time() - part.lstat().st_mtime >= seconds:
                     part.unlink()

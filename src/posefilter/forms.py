@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from posefilter.errors import UserError
+from posefilter.errors import UserError, printable
 
 MOST = 1e30  # of a number: beyond, sums and charts end in infinity
 
@@ -33,11 +33,18 @@ _KINDS: dict[str, Callable[[Any], bool]] = {
 def parse_json(content: bytes | str) -> Any:
     """Parse JSON whose numbers can be computed with.
 
+    Halves of signs, as `ud800` behind a backslash, with which no picture can be drawn, become
+    question marks.
+
     Raises:
         ValueError: It is no JSON, or a number in it is NaN, infinite, or beyond 1e30.
         RecursionError: It is nested too deeply.
     """
-    return json.loads(content, parse_int=_whole, parse_float=_bounded, parse_constant=_bounded)
+    value = json.loads(content, parse_int=_whole, parse_float=_bounded, parse_constant=_bounded)
+    text = content if isinstance(content, bytes) else content.encode("utf-8", "replace")
+    if rb"\ud" in text.lower():
+        value = json.loads(json.dumps(value, ensure_ascii=False).encode("utf-8", "replace"))
+    return value
 
 
 def check_form(value: Any, form: Any, path: Path, place: str = "") -> None:
@@ -71,7 +78,8 @@ def check_form(value: Any, form: Any, path: Path, place: str = "") -> None:
             if needed and name not in value:
                 raise UserError(f"{its} has no {name}")
             if not isinstance(form, dict) or value.get(name) is not None:
-                check_form(value[name], own, path, f"{place}.{name}".lstrip("."))
+                within = f"{place}.{printable(str(name))}".lstrip(".")
+                check_form(value[name], own, path, within)
 
 
 def _whole(text: str) -> int:

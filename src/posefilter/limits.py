@@ -18,7 +18,12 @@ MOST_SIDE, MOST_PIXELS = 16_384, 1 << 27  # of an image: a photograph of 100 meg
 MOST_SCANS = 100  # of a JPEG: encoders write up to 20, and each goes through all of the image
 FEWEST_KNOWN = 0.001  # share of an image's pixels with depth, below which it cannot be judged
 MOST_BYTES = 1 << 29  # of an image's or JSON's file
+MOST_YAML = 1 << 18  # of a file of settings, or of a camera: its reader takes seconds for these
+_NUMBERS = ("tag:yaml.org,2002:int", "tag:yaml.org,2002:float")
+_LONGEST_NUMBER = 1000  # of YAML [signs]
 _MARKER = re.compile(rb"\xff([^\x00\x01\xd0-\xd8\xff])")  # of a JPEG, that has a length or ends it
+_FORMATS = ("PNG", "JPEG", "GIF", "BMP", "PPM")  # that PIL knows before it looks for more
+_RARE_FORMATS = ("TIFF", "WEBP", "JPEG2000", "AVIF", "SUN")
 _OTHERS = {  # by what files begin with, that are named for images
     b"\x93NUMPY": "it is an array: end its name in .npy",
     b"PK\x03\x04": "it is an archive, as .npz is: save the array by np.save",
@@ -121,7 +126,7 @@ def read_json(
         raise BadData(path, "not readable as JSON", f"truncated? {error}") from error
 
 
-def read_yaml(path: Path, most: int) -> Any:
+def read_yaml(path: Path, most: int = MOST_YAML) -> Any:
     """Read a YAML file of plain data without aliases: one document, which empty ones may follow,
     as `ros2 topic echo` ends each message with `---`; also one of OpenCV's FileStorage.
 
@@ -132,31 +137,50 @@ def read_yaml(path: Path, most: int) -> Any:
     Raises:
         BadData: The file is missing, larger, may not be read, or is no YAML.
     """
+    data = read_bytes(path, most)
     try:
         # a SafeLoader, which makes nothing but plain data
-        text = read_bytes(path, most).decode().removeprefix("%YAML:1.0")  # no directive of YAML's
+        text = data.decode().removeprefix("%YAML:1.0")  # no directive of YAML's
         documents = yaml.load_all(text, Loader=PlainLoader)
         first = next(documents, None)
         if any(other is not None for other in documents):
             raise yaml.YAMLError("it has several documents: keep one of them")
         return first
-    # YAML, UTF-8, whole numbers too long to read, days that there are not
-    except (yaml.YAMLError, ValueError, RecursionError) as error:
+    # YAML, UTF-8, days that there are not, a value that its tag (!!bool) does not fit: anything
+    except Exception as error:
         raise BadData(path, "is no YAML", find_reason(error)) from error
 
 
 class PlainLoader(yaml.SafeLoader):
-    """YAML without aliases: a few lines of them stand for more than fits into memory."""
+    """YAML without aliases: a few lines of them stand for more than fits into memory. Nor are there
+    long numbers: those to the base of 60 (`1:1:1`) take the square of their length.
+    """
 
     def compose_node(self, parent: Any, index: Any) -> Any:
-        """Compose a node.  Raises yaml.YAMLError for an alias."""
+        """Compose a node.  Raises yaml.YAMLError for an alias, or a long number."""
         if self.check_event(yaml.AliasEvent):
             raise yaml.YAMLError("it has an alias (*name), which settings do not need")
-        return super().compose_node(parent, index)
+        node: Any = super().compose_node(parent, index)
+        if node.tag in _NUMBERS and len(node.value) > _LONGEST_NUMBER:
+            raise yaml.YAMLError(f"it has a number of {len(node.value):,} signs")
+        return node
 
 
 # OpenCV's, as its JSON has it: rows, cols, dt, data
 PlainLoader.add_constructor("tag:yaml.org,2002:opencv-matrix", PlainLoader.construct_yaml_map)
+
+
+def open_picture(data: bytes) -> Image.Image:
+    """Open a picture of a format that pictures have, whatever its file is called.
+
+    Raises UnidentifiedImageError for others: PIL would start Ghostscript, a program, for EPS.
+    """
+    try:
+        return Image.open(io.BytesIO(data), formats=_FORMATS)
+    except UnidentifiedImageError:
+        Image.init()
+        others = [kind for kind in _RARE_FORMATS if kind in Image.OPEN]  # AVIF: not in older PIL
+        return Image.open(io.BytesIO(data), formats=others)
 
 
 def check_picture(path: Path, data: bytes) -> int:
@@ -168,7 +192,7 @@ def check_picture(path: Path, data: bytes) -> int:
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            with Image.open(io.BytesIO(data)) as image:
+            with open_picture(data) as image:
                 width, height = image.size
     except Image.DecompressionBombError as error:
         raise BadData(path, "image too large", str(error)) from error

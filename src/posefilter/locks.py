@@ -8,7 +8,7 @@ import time
 from contextlib import suppress
 from pathlib import Path
 
-from posefilter.errors import UserError
+from posefilter.errors import UserError, printable
 
 try:
     import fcntl
@@ -114,6 +114,7 @@ def _state(path: Path) -> os.stat_result | None:
 
 def _owner(folder: Path) -> str:
     try:
-        return (folder / LOCK).read_text(errors="replace").strip()[:80] or "unknown"
+        with (folder / LOCK).open("rb") as file:
+            return printable(file.read(80).decode(errors="replace").strip()) or "unknown"
     except OSError:
         return "unknown"

@@ -5,7 +5,9 @@ import unicodedata
 from functools import lru_cache
 from pathlib import Path, PureWindowsPath
 
-from posefilter.errors import UserError
+from posefilter.errors import UserError, printable
+
+_FORMULAS = ("=", "+", "-", "@")  # what begins so a spreadsheet computes
 
 
 def find_conf() -> Path:
@@ -27,9 +29,16 @@ def is_plain_name(name: str) -> bool:
         and name.isprintable()
         and len(name.encode()) <= 200
         and name == name.strip()
-        and not same.startswith((".", "~", "=", "+", "-", "@"))
+        and not same.startswith((".", "~", *_FORMULAS))
         and not set(same) & set("/\\:")
     )
+
+
+def name_in_table(name: str) -> str:
+    """Return a file's name as a table has it: as it is, but for what a terminal would obey, and a
+    `./` ahead of what a spreadsheet would take for a formula.
+    """
+    return f"./{printable(name)}" if name.startswith(_FORMULAS) else printable(name)
 
 
 def stays_inside(path: str, folder: Path) -> bool:
@@ -70,15 +79,21 @@ def check_inside(path: Path, root: Path) -> Path:
     return path
 
 
-def check_links(folder: Path) -> None:
-    """Raise UserError where a link leads out of a folder: what is written would go elsewhere."""
+def check_links(folder: Path, instead: str = "give another out=") -> None:
+    """Raise UserError where a link leads out of a folder: what is written would go elsewhere.
+
+    Args:
+        folder: The folder; it need not be there.
+        instead: What to do where the link is to stay, for messages.
+    """
     home = os.path.realpath(folder)
     for place, folders, files in os.walk(folder):
         for name in (*folders, *files):
             path = Path(place, name)
             if path.is_symlink() and os.path.commonpath([os.path.realpath(path), home]) != home:
                 raise UserError(
-                    f"{path}: is a link that leads out of its run's folder; remove it, or give out="
+                    f"{path}: is a link that leads out of {folder}, and what is written would go "
+                    f"elsewhere; remove it, or {instead}"
                 )
 
 

@@ -3,14 +3,16 @@
 import difflib
 import io
 import os
+import shlex
 from collections.abc import Iterable, Sequence
 from fnmatch import fnmatch
 from pathlib import Path
-from typing import Any
-from urllib.parse import urlparse
+from typing import Any, BinaryIO
+from urllib.parse import urljoin, urlparse
 
 from posefilter.errors import UserError, find_reason
 from posefilter.files import write_whole
+from posefilter.limits import read_bytes
 from posefilter.paths import is_plain_name
 
 # the address of a folder of weights with a registry.txt: lines of `<name>.ckpt sha256:<digest>`
@@ -18,7 +20,10 @@ URL = "POSEFILTER_WEIGHTS_URL"
 # where what was fetched is kept; unset: the system's place for caches
 CACHE = "POSEFILTER_CACHE"
 ALL = "all"  # the weights that ship
-_REGISTRY, _TIMEOUT = "registry.txt", 30  # [s]
+_REGISTRY, _TIMEOUT, _RETRIES = "registry.txt", 30, 2  # [s]
+_MOST_LIST, MOST_BYTES = 1 << 20, 1 << 30  # of a list, and of weights that are fetched
+_LONGEST = 1000  # of a line of a list
+_SHOWN = 20  # names of a list
 _HERE = Path(__file__).parent
 # of an installed wheel, and of a clone
 FOLDERS = (_HERE / "weights", _HERE.parents[1] / "weights")
@@ -128,20 +133,77 @@ def expand_weights(
     return list(dict.fromkeys(found))
 
 
-def _fetch_registry(loader: Any, url: str, index: Path, wanted: Path) -> None:
-    """Download the list of weights, whole or not at all, since others may read it meanwhile. Where
-    the address cannot be reached, weights that are in the cache are judged by the list there.
+class _Bounded:
+    """A file that is written by a download, and ends it where more comes than there should.
+
+    Args:
+        file: Gets what comes.
+        most: Bytes that may come.
+        url: Where it comes from, for messages.
     """
+
+    def __init__(self, file: BinaryIO, most: int, url: str) -> None:
+        self._file, self._most, self._url = file, most, url
+
+    def write(self, data: bytes) -> None:
+        """Write a part.  Raises UserError where it is too much."""
+        if self._file.tell() + len(data) > self._most:
+            raise UserError(f"{self._url}: too large: more than {self._most:,} bytes were sent")
+        self._file.write(data)
+
+    def flush(self) -> None:
+        """Do nothing: the file is flushed as it is closed."""
+
+
+def _stay_secure(response: Any, *_: object, **__: object) -> None:
+    """Raise UserError where a page of https leads to one of http, which anyone on the way may
+    change: the checksums of what is fetched come from it.
+    """
+    there = urljoin(response.url, response.headers.get("location", ""))
+    if response.is_redirect and urlparse(response.url).scheme == "https" != urlparse(there).scheme:
+        raise UserError(f"{response.url}: leads to {there[:200]}, which is not https")
+
+
+def _fetch_registry(url: str, index: Path, wanted: Path) -> bytes:
+    """Download the list of weights. Where the address cannot be reached, weights that are in the
+    cache are judged by the list there.
+    """
+    import pooch
     import requests
 
+    loader = pooch.HTTPDownloader(timeout=_TIMEOUT, hooks={"response": _stay_secure})
     content = io.BytesIO()
     try:
-        loader(url + _REGISTRY, content, None)
+        loader(url + _REGISTRY, _Bounded(content, _MOST_LIST, url + _REGISTRY), None)
     except (requests.ConnectionError, requests.Timeout):
         if not (wanted.is_file() and index.is_file()):
             raise
-    else:
-        write_whole(index, content.getvalue())
+        return read_bytes(index, _MOST_LIST)
+    return content.getvalue()
+
+
+def _parse_registry(content: bytes) -> tuple[dict[str, str], dict[str, str]]:
+    """Return the checksum of each file of a list, and the address of those that have one.
+
+    Raises ValueError where a line is none of a list.
+    """
+    checksums, addresses = dict[str, str](), dict[str, str]()
+    for number, line in enumerate(content.decode("utf-8-sig").splitlines(), 1):
+        line = line.expandtabs().strip()
+        if line.startswith("#"):
+            continue
+        if len(line) > _LONGEST or not line.isprintable():
+            raise ValueError(f"line {number} of its list is too long, or not to be printed")
+        match shlex.split(line):
+            case []:
+                continue
+            case [name, checksum]:
+                checksums[name] = checksum.lower()
+            case [name, checksum, address]:
+                checksums[name], addresses[name] = checksum.lower(), address
+            case _:
+                raise ValueError(f"line {number} of its list should be: NAME.ckpt sha256:DIGEST")
+    return checksums, addresses
 
 
 def fetch_weights(name: str, url: str, cache: Path | None = None) -> Path:
@@ -163,19 +225,29 @@ def fetch_weights(name: str, url: str, cache: Path | None = None) -> Path:
     url = url.rstrip("/") + "/"
     folder = Path(cache or os.environ.get(CACHE) or pooch.os_cache("posefilter"))
     folder.mkdir(parents=True, exist_ok=True)
+    index, file = folder / _REGISTRY, f"{name}.ckpt"
     loader = pooch.HTTPDownloader(timeout=_TIMEOUT)
-    index = folder / _REGISTRY
+
+    def load(address: str, place: str, pooch: Any) -> None:
+        with Path(place).open("wb") as opened:
+            loader(address, _Bounded(opened, MOST_BYTES, url + file), pooch)
+
     try:
-        _fetch_registry(loader, url, index, folder / f"{name}.ckpt")
-        keeper = pooch.create(folder, url, retry_if_failed=2)
-        keeper.load_registry(index)
-        file = f"{name}.ckpt"
-        if file not in keeper.registry:
-            names = ", ".join(sorted(keeper.registry)) or "nothing"
-            raise UserError(f"checkpoint={name}: {url} lists {names}")
-        if not keeper.registry[file].startswith("sha256:"):
+        content = _fetch_registry(url, index, folder / file)
+        checksums, addresses = _parse_registry(content)
+        if file not in checksums:
+            names = sorted(checksums)
+            more = f" and {len(names) - _SHOWN} more" if len(names) > _SHOWN else ""
+            raise UserError(
+                f"checkpoint={name}: {url} lists {', '.join(names[:_SHOWN]) or 'nothing'}{more}"
+            )
+        if not checksums[file].startswith("sha256:"):
             raise UserError(f"{url}{_REGISTRY}: gives no sha256 of {file}")
-        return Path(keeper.fetch(file, downloader=loader))
+        write_whole(index, content)  # whole or not at all: others may read it meanwhile
+        keeper = pooch.create(
+            folder, url, registry=checksums, urls=addresses, retry_if_failed=_RETRIES
+        )
+        return Path(keeper.fetch(file, downloader=load))
     except (requests.RequestException, ConnectionError) as error:
         raise UserError(
             f"checkpoint={name}: {url} cannot be fetched ({type(error).__name__})"

@@ -64,6 +64,22 @@ def test_an_interrupted_training_goes_on_where_only_its_test_is_another(
         start_from(make_job("data.limit_train=9"))
 
 
+@pytest.mark.parametrize("step", [None, "7", -1, 1 << 70])
+def test_weights_alone_are_no_training_to_go_on_with(
+    step: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As export.py writes them; or of somebody else, who has put anything there."""
+    job = replace(compose_job("train", CONF, [], tmp_path), swept=True)
+    checkpoint = {"recipe": recipe(job)} | ({} if step is None else {"global_step": step})
+    (tmp_path / "checkpoints").mkdir()
+    (tmp_path / "checkpoints" / "last.ckpt").touch()
+    monkeypatch.setattr(reuse, "read_checkpoint", lambda file: checkpoint)
+    with pytest.raises(
+        UserError, match=r"last\.ckpt: is of no training that can go on .* warm_start="
+    ):
+        start_from(job)
+
+
 def test_what_another_job_has_learned_comes_without_its_calibration(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -2,14 +2,18 @@
 
 import hashlib
 import http.server
+import io
 import threading
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import requests
 
+import posefilter.weights
 from posefilter.cli.checkpoints import find_checkpoint
 from posefilter.errors import UserError
 from posefilter.weights import (
@@ -33,6 +37,7 @@ class Server(http.server.ThreadingHTTPServer):
         self.asked: list[str] = []
         self.cuts: list[int] = []  # after how many bytes to cut each of the next files
         self.status, self.registry = 0, f"duck.ckpt sha256:{SHA}\n"
+        self.endless = ""  # the end of an address that sends without an end
 
     @property
     def url(self) -> str:
@@ -48,6 +53,13 @@ class Handler(http.server.BaseHTTPRequestHandler):
             self.send_error(self.server.status)
             return
         index = self.path.endswith("registry.txt")
+        if self.path.endswith(self.server.endless or "nothing"):
+            self.send_response(200)
+            self.end_headers()
+            with suppress(OSError):  # the connection is closed
+                while True:
+                    self.wfile.write(bytes(1 << 20))
+            return
         body = self.server.registry.encode() if index else CONTENT
         self.send_response(200)
         self.send_header("Content-Length", str(len(body)))
@@ -169,18 +181,80 @@ def test_a_damaged_file_in_the_cache_is_fetched_anew(server: Server, tmp_path: P
     [
         ("goose.ckpt sha256:00\n", 0, "lists goose.ckpt"),
         (f"duck.ckpt md5:{'0' * 32}\n", 0, "gives no sha256"),
-        ("a b c d\n", 0, "sent something else"),
+        ("a b c d\n", 0, "line 1 of its list should be: NAME.ckpt sha256:DIGEST"),
+        ("\n# a\n" + "a" * 800_000, 0, "line 3 of its list is too long"),
+        ("\x1b]0;owned\x07.ckpt sha256:00\n", 0, "line 1 of its list is too long, or not to be"),
+        (f"duck.ckpt sha256:{SHA} http://\x1b[2J/\n", 0, "line 1 of its list is too long, or not"),
+        ("\n".join(f"{i:05}.ckpt sha256:00" for i in range(9999)), 0, "19.ckpt and 9979 more$"),
+        (f"duck.ckpt sha256:{SHA} file:///etc/passwd\n", 0, "cannot be fetched"),
         ("", 404, "cannot be fetched"),
         ("", 500, "cannot be fetched"),
     ],
 )
 def test_what_cannot_be_fetched_is_one_line(
-    server: Server, tmp_path: Path, registry: str, status: int, told: str
+    server: Server,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    registry: str,
+    status: int,
+    told: str,
 ) -> None:
+    monkeypatch.setattr(posefilter.weights, "_RETRIES", 0)
     server.registry, server.status = registry, status
     with pytest.raises(UserError, match=told) as caught:
         fetch_weights("duck", server.url, tmp_path)
     assert "\n" not in str(caught.value)
+    assert len(str(caught.value)) < 500
+
+
+@pytest.mark.parametrize("what", ["registry.txt", "duck.ckpt"])
+def test_what_is_sent_without_an_end_is_neither_held_nor_kept(
+    server: Server, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, what: str
+) -> None:
+    monkeypatch.setattr(posefilter.weights, "MOST_BYTES", 1 << 22)
+    server.endless = what
+    with pytest.raises(UserError, match=f"/weights/{what}: too large: more than"):
+        fetch_weights("duck", server.url, tmp_path)
+    assert not list(tmp_path.glob("*.ckpt"))
+    assert sum(file.stat().st_size for file in tmp_path.iterdir()) < 1000
+    assert server.asked.count("/weights/duck.ckpt") == (what == "duck.ckpt")
+
+
+def test_a_damaged_list_does_not_replace_the_one_before(server: Server, tmp_path: Path) -> None:
+    fetch_weights("duck", server.url, tmp_path)
+    before = (tmp_path / "registry.txt").read_bytes()
+    server.registry = "<html>"
+    with pytest.raises(UserError, match="should be: NAME"):
+        fetch_weights("duck", server.url, tmp_path)
+    assert (tmp_path / "registry.txt").read_bytes() == before
+
+
+@pytest.mark.parametrize(
+    ("place", "told"),
+    [("http://other/registry.txt", "is not https"), ("file:///x", "is not https"),
+     ("/x", ""), ("https://other/x", "")],
+)  # fmt: skip
+def test_a_list_by_https_leads_to_no_other(
+    place: str, told: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The checksums are in it: over http anyone on the way may write others."""
+
+    class Redirecting(requests.adapters.BaseAdapter):
+        def send(self, request: requests.PreparedRequest, *_: object, **__: object) -> Any:
+            response = requests.Response()
+            response.request, response.url = request, str(request.url)
+            response.raw = io.BytesIO()
+            response.status_code = 302 if "first" in response.url else 404
+            response.headers["location"] = place
+            return response
+
+        def close(self) -> None:
+            pass
+
+    monkeypatch.setattr(requests.Session, "get_adapter", lambda *_, **__: Redirecting())
+    with pytest.raises(UserError, match=told or "cannot be fetched") as caught:
+        fetch_weights("duck", "https://first/weights", tmp_path)
+    assert bool(told) == ("leads to" in str(caught.value))
 
 
 def test_only_names_are_fetched(

@@ -1,17 +1,25 @@
 """Files of a run of somebody else: a page is made of them, or one line says what is wrong."""
 
 import json
+import os
+import re
 from collections.abc import Callable
+from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
+from torch.utils.tensorboard import SummaryWriter
 
 from posefilter.errors import UserError
+from posefilter.files import write_whole
+from posefilter.metrics import image_errors
 from posefilter.metrics.image_errors import ImageError
 from posefilter.report.gather import read_run
 from posefilter.report.run_page import make_run_page
 from posefilter.report.settings import compare_settings
+from posefilter.report.sweep_page import make_sweep_page
 from posefilter.report.sweeps import parse_number, read_sweep
 
 LEVELS = [0.5, 0.8, 0.9, 0.95]
@@ -79,6 +87,87 @@ TAKEN: dict[str, Change] = {
     "zeros": change_numbers(0),
     "large numbers": change_numbers(1e30),
 }
+
+
+EVIL = (
+    "\ud800\"><script>alert(1)</script><img src=x onerror=alert(1)>'$x^{\\frac{$ ../../up\x1b[2J"
+    "\u202e{{7*7}}{%raw%}=1+1"
+)
+
+
+class Seen(HTMLParser):
+    """What a browser would act on."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.found: list[str] = []
+        self.feed(text)
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        if tag in ("script", "iframe", "object", "embed", "form", "base", "link", "svg"):
+            self.found.append(tag)
+        for name, value in attrs:
+            inner = (value or "").startswith(("#", "data:image/"))
+            if name.startswith("on") or (name in ("src", "srcset", "href") and not inner):
+                self.found.append(f"{tag} {name}={value}")
+
+
+def spoil(value: Any) -> Any:
+    """Return content with every text, and a name in each mapping, that does something."""
+    if isinstance(value, dict):
+        return {
+            **{key: spoil(one) for key, one in value.items()},
+            EVIL: EVIL,
+            EVIL + "2": {EVIL: 1},
+        }
+    if isinstance(value, list):
+        return [spoil(one) for one in value]
+    return EVIL if isinstance(value, str) else value
+
+
+def spoil_metrics(metrics: dict[str, Any]) -> dict[str, Any]:
+    ranges = {name: spoil(one) for name, one in metrics.pop("by_visibility").items()}
+    more = {"versions": {EVIL: EVIL}, "data": {"objects": [EVIL], "splits": {EVIL: {EVIL: 1}}}}
+    return {**spoil(metrics), "by_visibility": ranges, "overrides": [f"a={EVIL}"], **more}
+
+
+def test_names_of_a_run_do_nothing_in_its_page(run: Path) -> None:
+    rewrite(run, spoil_metrics)
+    (run / "metrics_train.json").write_bytes((run / "metrics.json").read_bytes())
+    rows = [ImageError(1, 1, 1, EVIL[1:], EVIL[1:], 0.5, 9, 9, 9, 0.5, 0.5, 0.5)]
+    image_errors.write_errors(run / "errors.csv", rows)
+    with SummaryWriter(str(run)) as log:
+        for tag in (
+            f"val/{EVIL[1:]}",
+            f"3_belief/{EVIL[1:]}",
+            "../../up",
+            "filter/ess/step_" + "9" * 5000,
+        ):
+            log.add_scalar(tag, 1.0, 5)
+            log.add_image(tag, np.zeros((8, 8, 3), np.uint8), 5, dataformats="HWC")
+    odd = [b"<script>", b"1\xc2\xb22", b"=1+1", b"\xff\x1b[2J"]
+    for name in odd:
+        place = os.fsencode(run / "figures") + b"/" + name + b".png"
+        os.link(run / "figures" / "best_0.png", place)
+    (run / "figures" / "x.png").write_bytes(b"<svg onload=alert(1)>")
+    page = make_run_page(read_run(run), compare_settings({}, {}), "x")
+    assert Seen(page.render()).found == []
+    assert "&lt;script&gt;" in page.render()
+    assert all(re.fullmatch(r"[\w.\-]+", name) for name in page.files())
+    write_whole(run / "report" / "report.html", page.render())
+
+
+def test_names_of_a_sweep_do_nothing_in_its_page(sweep: Path) -> None:
+    for file in sweep.rglob("metrics.json"):
+        metrics = json.loads(file.read_text())
+        kept = [one for one in metrics["overrides"] if not one.startswith(("out", "refine"))]
+        setting = f"refine={EVIL}{file.parent.name}"
+        file.write_text(json.dumps({**spoil_metrics(metrics), "overrides": [*kept, setting]}))
+    folder = next(path for path in sorted(sweep.iterdir()) if path.is_dir())
+    folder.rename(sweep / os.fsdecode(b"\xff\x1b[2J"))
+    page = make_sweep_page(read_sweep(sweep), None, None, "x")
+    assert Seen(page.render()).found == []
+    assert all(re.fullmatch(r"[\w.\-]+", name) for name in page.files())
 
 
 def make_page(folder: Path) -> dict[str, str]:

@@ -71,6 +71,7 @@ def test_scalars_and_pictures_are_read(run: Path) -> None:
     assert [p.name for p in shown["belief"]] == ["3_belief/belief"]
     assert record.missing == ["No errors.csv: what the test found in single images is not known."]
     assert sorted(["a10", "a9", "b1"], key=sort_by_number) == ["a9", "a10", "b1"]
+    assert sorted(["1²2", "1²", "a"], key=sort_by_number)  # ² is a digit, and no number
 
 
 def test_a_resumed_run_is_one_curve() -> None:

@@ -53,6 +53,9 @@ def bmp(width: int, height: int) -> bytes:
     return bytes(data)
 
 
+# PIL would have Ghostscript run it
+PROGRAM = b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 64 64\n%%EndComments\n" + b"%\n" * 50_000
+
 PICTURES = {
     "png": png(100_000, 100_000),
     "wide png": png(1 << 30, 1),
@@ -60,6 +63,7 @@ PICTURES = {
     "jpeg": jpeg(65_000, 65_000),
     "bmp": bmp(100_000, 100_000),
     "no image": b"hostile",
+    "a program for a printer": PROGRAM,
 }
 
 
@@ -334,9 +338,13 @@ BOMB = "a: &a [x, x]\n" + "".join(
      ("a: !!opencv-matrix [1]", "is no YAML"), ("a: !!opencv-matrix {" * 5_000, "is no YAML"),
      ("a: !!opencv-matrix {data: !!python/name:os.system }", "is no YAML"),
      ("%YAML:1.0\n---\na: &a !!opencv-matrix {data: *a}", "alias"),
-     ("a: 1\n---\n" + BOMB, "alias")],
+     ("a: 1\n---\n" + BOMB, "alias"),
+     ("a: " + ":".join(["1"] * 60_000), "a number of"),
+     ("a: 1:" + ":".join(["1"] * 60_000) + ".5", "a number of"),
+     *((f"a: {value}", "is no YAML") for value in ("!!int ''", "!!bool x", "!!timestamp x"))],
     ids=["alias bomb", "loop", "function", "large", "deep", "matrix of a list", "deep matrix",
-         "matrix of a function", "matrix in a loop", "bomb in a second document"],
+         "matrix of a function", "matrix in a loop", "bomb in a second document",
+         "base of 60", "fraction to the base of 60", "no number", "no truth", "no time"],
 )  # fmt: skip
 def test_a_runs_settings_are_plain(text: str, told: str, tmp_path: Path, watch: Any) -> None:
     (tmp_path / ".hydra").mkdir()
@@ -352,6 +360,36 @@ def test_a_picture_of_too_many_pixels_is_not_packed_into_a_page(
 ) -> None:
     with watch, pytest.raises(ValueError, match="too large"):
         encode_image(png(*size))
+
+
+def test_a_program_for_a_printer_is_no_picture(
+    tmp_path: Path, watch: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Whatever its file is called: neither in a run's figures nor as a texture."""
+    monkeypatch.setattr("PIL.EpsImagePlugin.gs_binary", None)  # which is looked for once
+    corners = np.array([[0, 0], [1, 0], [0, 1]], np.float32).tobytes()
+    change: dict[str, Any] = {
+        "images": [{"bufferView": 1, "mimeType": "image/png"}],
+        "textures": [{"source": 0}],
+        "materials": [{"pbrMetallicRoughness": {"baseColorTexture": {"index": 0}}}],
+        "meshes": [
+            {"primitives": [{"attributes": {"POSITION": 0, "TEXCOORD_0": 1}, "material": 0}]}
+        ],
+        "accessors": [
+            {"bufferView": 0, "componentType": 5126, "count": 3, "type": "VEC3"},
+            {"bufferView": 2, "componentType": 5126, "count": 3, "type": "VEC2"},
+        ],
+        "bufferViews": [
+            {"buffer": 0, "byteLength": 36},
+            {"buffer": 0, "byteOffset": 60, "byteLength": len(PROGRAM)},
+            {"buffer": 0, "byteOffset": 36, "byteLength": 24},
+        ],
+    }
+    (tmp_path / "x.glb").write_bytes(glb(change, corners + PROGRAM))
+    with watch, pytest.raises(ValueError, match="header cannot be read"):
+        encode_image(PROGRAM)
+    with watch, pytest.raises(UserError, match="header cannot be read"):
+        read_mesh(tmp_path / "x.glb", "x")
 
 
 def test_a_texture_of_too_many_pixels_is_not_decoded(tmp_path: Path, watch: Any) -> None:

@@ -30,7 +30,7 @@ from posefilter.data.points import read_model_points
 from posefilter.data.readers.decode import read_color, read_size
 from posefilter.data.readers.ycb_video_files import read_meta
 from posefilter.errors import UserError
-from posefilter.meshes import obj
+from posefilter.meshes import obj, polygons
 from posefilter.meshes.files import read_mesh
 from posefilter.meshes.symmetries import read_symmetries
 from posefilter.metrics.bop_results import read_poses_csv
@@ -420,6 +420,82 @@ def test_a_mesh_that_grows_is_refused(
     path = pictures / "x.obj"
     path.write_text(text)
     assert told in refuse(lambda: read_mesh(path, "x"))
+
+
+def spiral(corners: int) -> str:
+    """A face whose ears are found last: splitting it takes the cube of its corners."""
+    turns = 0.1 * np.arange(corners // 2)
+    inner = (1 + 0.1 * turns) * np.exp(1j * turns)
+    outline = [*(inner * (1 + 0.005 / abs(inner))), *inner[::-1]]
+    rows = [f"v {z.real} {z.imag} 0" for z in outline]
+    return "\n".join([*rows, "f " + " ".join(map(str, range(1, len(rows) + 1))), ""])
+
+
+def test_a_face_that_takes_hours_to_split_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(polygons, "_MOST_TRIED", 5e6)  # of half a minute
+    path = tmp_path / "x.obj"
+    path.write_text(spiral(1000))
+    assert "take too long to split" in refuse(lambda: read_mesh(path, "x"))
+    path.write_text(spiral(100))
+    assert len(read_mesh(path, "x").faces) == 98
+
+
+def test_many_faces_that_take_their_time_are_refused_together(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(polygons, "_MOST_TRIED", 5e6)
+    corners = [spiral(size).splitlines() for size in range(200, 240, 2)]
+    rows = [row for own in corners for row in own[:-1]]
+    faces, first = list[str](), 0
+    for own in corners:
+        numbers = range(first, first + len(own) - 1)
+        faces.append(f"{len(numbers)} {' '.join(map(str, numbers))}")
+        first += len(numbers)
+    path = tmp_path / "x.obj"
+    text = "\n".join(["f " + " ".join(str(int(i) + 1) for i in f.split()[1:]) for f in faces])
+    path.write_text("\n".join(rows) + "\n" + text + "\n")
+    assert "take too long to split" in refuse(lambda: read_mesh(path, "x"))
+    head = (
+        f"ply\nformat ascii 1.0\nelement vertex {first}\nproperty float x\nproperty float y\n"
+        f"property float z\nelement face {len(faces)}\nproperty list int int vertex_indices\n"
+        "end_header\n"
+    )
+    path = tmp_path / "x.ply"
+    path.write_text(head + "\n".join([*(row[2:] for row in rows), *faces]) + "\n")
+    assert "take too long to split" in refuse(lambda: read_mesh(path, "x"))
+
+
+LINES = {
+    "a library named often": ("mtllib x.mtl\n" * 100_000, "Kd 1 0 0\n" * 50_000),
+    "a library named often in a line": ("mtllib " + "x.mtl " * 100_000, "Kd 1 0 0\n" * 50_000),
+    "a library named in many ways": (
+        "\n".join(f"mtllib {'a/../' * i}x.mtl" for i in range(200)), "Kd 1 0 0\n" * 50_000,
+    ),
+    "many options of a picture": ("mtllib x.mtl\n", f"map_Kd {'-clamp on ' * 200_000}x.png"),
+    "a picture moved often": ("mtllib x.mtl\n", f"map_Kd {'-s 1 ' * 200_000}x.png"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("what", LINES)
+def test_a_line_of_a_mesh_is_not_read_over_and_over(what: str, tmp_path: Path) -> None:
+    text, materials = LINES[what]
+    (tmp_path / "a").mkdir()
+    (tmp_path / "x.mtl").write_text(f"newmtl a\n{materials}\n")
+    path = tmp_path / "x.obj"
+    path.write_text(f"{text}\n{CORNERS}usemtl a\nf 1 2 9\n")
+    told = "x.png: missing texture" if "map_Kd" in materials else "names a vertex that is not there"
+    assert told in refuse(lambda: read_mesh(path, "x"))
+
+
+@pytest.mark.parametrize("filling", ["\n", " \n", " ", "property ", "property\n", "a ", "a"])
+@pytest.mark.parametrize("start", ["", "property ", "element face ", "comment "])
+def test_a_long_header_of_a_ply_file_is_read_once(start: str, filling: str, tmp_path: Path) -> None:
+    path = tmp_path / "x.ply"
+    long = start + filling * (500_000 // len(filling))
+    path.write_text(f"ply\nformat ascii 1.0\n{long}!\nelement vertex 3\nend_header\n")
+    assert "x.ply" in refuse(lambda: read_mesh(path, "x"))
 
 
 def scans(count: int, read: Callable[[Path], Any], path: Path) -> Any:

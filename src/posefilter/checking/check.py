@@ -21,7 +21,7 @@ from posefilter.data.frames import FrameRecord, Implausible, NotShown
 from posefilter.data.readers.base import BaseReader
 from posefilter.data.readers.checked import index_records, read_checked
 from posefilter.data.silhouette import Geometry
-from posefilter.errors import BadData, UserError
+from posefilter.errors import BadData, UserError, printable
 from posefilter.files import write_whole
 from posefilter.meshes.mesh import LOOKALIKE
 from posefilter.meshes.store import MeshStore
@@ -112,7 +112,7 @@ def format_report(report: dict[str, Any]) -> str:
         table.add_row(Text(row["object"]), str(row["frames"]), *numbers)
     console = Console(width=110, record=True, file=io.StringIO(), color_system=None)
     console.print(table)
-    lines = [f"  - {problem}" for problem in report["problems"]]
+    lines = [f"  - {printable(problem)}" for problem in report["problems"]]
     left_out = report["left_out"]
     note = f"left out, look-alikes without a mesh: {', '.join(left_out)}\n" if left_out else ""
     found = "\n".join(["problems:", *lines]) if lines else "no problems found"

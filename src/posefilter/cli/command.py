@@ -54,6 +54,7 @@ from posefilter.errors import (
     ProblemsFound,
     Stopped,
     UserError,
+    printable,
 )
 from posefilter.files import write_whole
 from posefilter.locks import release_all
@@ -139,7 +140,7 @@ def run_command(name: str, home: Path | None = None, arguments: list[str] | None
             write_record(record)
         if trace:
             traceback.print_exception(error)
-        print(f"{name}: {explain(error, name, conf, arguments)}", file=sys.stderr)
+        print(f"{name}: {printable(explain(error, name, conf, arguments))}", file=sys.stderr)
         return FAILURE if isinstance(error, _FAILED) else MISTAKE
     except Exception as error:
         write_record(record)

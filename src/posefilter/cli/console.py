@@ -18,6 +18,7 @@ from rich.text import Text
 from posefilter.cli.arguments import quote
 from posefilter.cli.choices import config_folders, typed_plugins
 from posefilter.cli.ranks import is_follower
+from posefilter.errors import printable_lines
 
 JSON = "json"
 Files = Mapping[str, Path | str]
@@ -28,7 +29,10 @@ def say(console: str, event: str, sentence: str, **content: Any) -> None:
     if is_follower():
         return
     print(
-        json.dumps({"event": event, **finite(content)}) if console == JSON else sentence, flush=True
+        json.dumps({"event": event, **finite(content)})
+        if console == JSON
+        else printable_lines(sentence),
+        flush=True,
     )
 
 
@@ -145,7 +149,14 @@ def settle_logging(console: str) -> None:
                 handler.setStream(sys.stderr)
             if console == JSON or is_follower():
                 handler.setLevel(logging.WARNING)
-            handler.setFormatter(logging.Formatter("%(message)s"))
+            handler.setFormatter(_Plain("%(message)s"))
+
+
+class _Plain(logging.Formatter):
+    """Writes lines without what a terminal would obey: names in files of others are in them."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        return printable_lines(super().format(record))
 
 
 def _report_thread(failed: threading.ExceptHookArgs) -> None:

@@ -72,6 +72,7 @@ def evaluate(job: Job) -> float:
         raise UserError("targets: go with estimates=poses.csv, not with a checkpoint")
     if job.cfg.estimates and read_pose_tolerance(job.cfg.pose_tolerance) is not None:
         raise UserError("pose_tolerance: is of a checkpoint's probability; estimates have none")
+    check_links(job.folder)  # of a run of somebody else, before anything in it is written
     read_results(job)  # refused where they are of another
     keep_training_results(job.folder)
     metrics, files = _of_estimates(job) if job.cfg.estimates else _of_checkpoint(job)
@@ -101,7 +102,6 @@ def _of_checkpoint(job: Job) -> tuple[dict[str, Any], dict[str, Path]]:
     method.pose_tolerance = tolerance or RIGHT
     if method.calibration is not None:
         method.calibration.fit_success(method.pose_tolerance)  # refused before anything is tested
-    check_links(job.folder)
     settings = data_settings(job, checkpoint["recipe"]["settings"], method.object_model.name)
     check_own_folders(settings, job)
     data = build_data(settings, job.cfg.console, job.overrides)

@@ -23,7 +23,7 @@ from posefilter.cli.choices import config_folders, list_choices, say_no_choice
 from posefilter.cli.instantiate import GIVEN, hint, tell_given
 from posefilter.cli.plain import key_of, to_plain
 from posefilter.cli.renamed import rename_argument, rename_missing
-from posefilter.errors import find_reason
+from posefilter.errors import find_reason, printable
 from posefilter.ranges import list_nodes
 
 # settings of Lightning's Trainer, which is not imported to tell a mistake
@@ -179,7 +179,7 @@ def first_line(error: BaseException) -> str:
 
     What a terminal would obey rather than show is replaced: names in files of others are quoted.
     """
-    return "".join(one if one.isprintable() else "?" for one in find_reason(error))
+    return printable(find_reason(error))
 
 
 def near(wrong: str, known: list[str]) -> str:

@@ -41,7 +41,7 @@ from posefilter.errors import UserError
 from posefilter.forms import NUMBER, TEXT
 from posefilter.meshes.inspect_mesh import list_concerns
 from posefilter.meshes.mesh import Mesh
-from posefilter.paths import find_conf
+from posefilter.paths import check_links, find_conf
 from posefilter.report.diagnostics import format_duration
 from posefilter.report.gather import read_run
 from posefilter.report.onboarding_page import make_onboarding_page
@@ -285,6 +285,7 @@ def onboard(job: Job) -> None:
         compose_job("train", find_conf(), overrides, Path())
     mesh = read_onboarded(cfg)
     out = Path(str(cfg.out)) if cfg.out else Path("outputs") / "onboard" / mesh.name
+    check_links(out)  # somebody else may have begun it
     hold_folder(out)
     check_folder(out, str(cfg.symmetries), mesh.name)
     work = Onboarding(cfg, mesh, out, Stages(out / RECORD, FOUND))

@@ -13,7 +13,7 @@ from posefilter.cli.plain import find, key_of
 from posefilter.cli.recipe import calls_resolver
 from posefilter.cli.renamed import update
 from posefilter.errors import BadData, UserError, naming
-from posefilter.limits import read_bytes, read_yaml
+from posefilter.limits import MOST_YAML, read_bytes, read_yaml
 from posefilter.paths import check_links, stays_inside
 
 LAST, BEFORE = "last.ckpt", "last.previous.ckpt"  # of a run's checkpoints
@@ -31,7 +31,6 @@ _OVERRIDE = re.compile(r"([+~]{0,2})([A-Za-z_][\w./@]*)(?:=(.*))?", re.DOTALL)
 _PLACES = ("cache_dir", "default_root_dir", "dirpath", "folder", "log_dir", "root_dir", "save_dir")
 _SENDING = ("mlflow", "wandb")  # loggers
 _LONGEST, _MOST = 1 << 16, 1000  # of a file of overrides [bytes], and of its lines
-_RECORD = 1 << 22  # of a file of settings [bytes]
 
 
 def run_folder(resume: str | Path) -> Path:
@@ -100,7 +99,7 @@ def keep_record(arguments: list[str]) -> dict[Path, bytes]:
     if given is None:
         return {}
     files = sorted((run_folder(given) / ".hydra").glob("*.yaml"))
-    return {file: read_bytes(file, _RECORD) for file in files}
+    return {file: read_bytes(file, MOST_YAML) for file in files}
 
 
 def overrides_of(folder: Path) -> list[str]:
@@ -193,7 +192,7 @@ def _find_recorded(key: str, folder: Path) -> Any:
     choice = key in _KEPT_GROUPS
     file = folder / ".hydra" / ("hydra.yaml" if choice else "config.yaml")
     try:
-        record = read_yaml(file, _RECORD)
+        record = read_yaml(file)
     except BadData as error:
         raise UserError(f"{file}: cannot be read, so that {key}= cannot be compared") from error
     return find(record, f"hydra.runtime.choices.{key}" if choice else key)

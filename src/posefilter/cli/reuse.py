@@ -21,6 +21,7 @@ from posefilter.errors import UserError
 # threads: another number adds up a gradient in another order, so that its last digits differ
 _LEARNED_FROM = ("model", "data", "trainer", "callbacks", "seed", "warm_start", "threads")
 _TESTED_WITH = ("limit_test", "workers", "progress")  # of the data
+_MOST_STEPS = 1 << 40
 _WORKERS = "data.workers"  # with other ones the same is learned, at another speed
 _SPEEDS = ("seconds_per_step", "cpu_seconds_per_step")
 
@@ -126,13 +127,14 @@ def start_from(job: Job) -> tuple[Path | None, int]:
         return None, 0
     last, *before = last_checkpoints(str(source))  # a folder's name may read as a number
     try:
-        checkpoint = read_checkpoint(last)
+        checkpoint, step = _read_training(last)
     except UserError as error:
         if not before:
             raise
         sentence = f"{error}; going on from {before[0]}"
         say(job.cfg.console, "fallback", sentence, broken=last, checkpoint=before[0])
-        last, checkpoint = before[0], read_checkpoint(before[0])
+        last = before[0]
+        checkpoint, step = _read_training(last)
     changed = [] if job.cfg.resume else differing(checkpoint["recipe"], recipe(job))
     changed = [key for key in changed if key not in {f"data.{name}" for name in _TESTED_WITH}]
     if changed:
@@ -140,7 +142,22 @@ def start_from(job: Job) -> tuple[Path | None, int]:
             f"{job.folder}: holds a run that was cut short, with other settings than now "
             f"({', '.join(changed[:5])}); delete it, or choose another out="
         )
-    return last, int(checkpoint["global_step"])
+    return last, step
+
+
+def _read_training(file: Path) -> tuple[dict[str, Any], int]:
+    """Return what a checkpoint of a training holds, and its step.
+
+    Raises UserError where it is broken, or has weights alone.
+    """
+    checkpoint = read_checkpoint(file)
+    step = checkpoint.get("global_step")
+    if not isinstance(step, int) or not 0 <= step < _MOST_STEPS:
+        raise UserError(
+            f"checkpoint={file}: is of no training that can go on (it has no step); a new one "
+            f"begins with its weights by warm_start={file}"
+        )
+    return checkpoint, step
 
 
 def find_begun(job: Job) -> Any:
@@ -151,4 +168,4 @@ def find_begun(job: Job) -> Any:
 
 def step_of(checkpoint: Path) -> int:
     """Return the step at which a checkpoint was written.  Raises UserError where it is broken."""
-    return int(read_checkpoint(checkpoint)["global_step"])
+    return _read_training(checkpoint)[1]

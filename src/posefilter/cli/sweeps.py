@@ -10,7 +10,7 @@ from omegaconf import DictConfig
 
 from posefilter.cli.console import JSON, ended, typed
 from posefilter.cli.folders import FAILED
-from posefilter.errors import Carrier, UserError
+from posefilter.errors import Carrier, UserError, printable_lines
 from posefilter.files import open_whole, open_whole_text, write_whole
 
 if TYPE_CHECKING:
@@ -45,7 +45,7 @@ class SweepSummary(Callback):
             files = {name: folder / name for name in names if (folder / name).is_file()}
             console = str(config.get("console", JSON))
             if console != JSON:
-                print((folder / "summary.md").read_text(encoding="utf-8"))
+                print(printable_lines((folder / "summary.md").read_text(encoding="utf-8")))
             ended(console, "swept", files, [typed("report", sweep=folder)], failed=failed)
         if failed:
             raise Carrier(

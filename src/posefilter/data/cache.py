@@ -17,7 +17,7 @@ import numpy as np
 from posefilter.data.frames import FrameRecord, Sample
 from posefilter.errors import UserError
 from posefilter.files import open_whole, remove_parts, stamp_files, write_whole
-from posefilter.paths import check_inside
+from posefilter.paths import check_inside, check_links
 
 CACHES = ("memory", "disk", "none")
 _HEADER = 4096  # bytes, at most, ahead of an array
@@ -84,8 +84,11 @@ class DiskCache:
         self.folder = folder / hashlib.sha256(f"{_LAYOUT} {version}".encode()).hexdigest()[:16]
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
-            (self.folder / "README").write_text(
-                f"decoded frames; may be deleted while no run uses them\n{version}\n"
+            check_inside(self.folder, folder)
+            check_links(self.folder, "set data.cache_dir")  # nor may what it brings lead out
+            write_whole(
+                self.folder / "README",
+                f"decoded frames; may be deleted while no run uses them\n{version}\n",
             )
             remove_parts(self.folder, ["*"], _STALE)
         except OSError as error:

@@ -13,7 +13,7 @@ from posefilter.data.readers.decode import numbers, read_array, whole_number
 from posefilter.errors import BadData, find_reason
 from posefilter.limits import read_bytes, read_json, read_lines, read_yaml
 
-_LARGEST = 1 << 24  # bytes
+_LARGEST = 1 << 24  # bytes of JSON
 # of the focal lengths and the principal point: BOP's, RealSense's, NeRF's
 _SINGLE = (("fx", "fy", "cx", "cy"), ("fx", "fy", "ppx", "ppy"), ("fl_x", "fl_y", "cx", "cy"))
 _FOURS = ("intrinsics", "intrinsic")  # fx, fy, cx, cy in a list: Kalibr's
@@ -64,7 +64,7 @@ def read_camera_file(path: Path) -> CameraFile:
     """
     ending = path.suffix.lower()
     if ending in (".yaml", ".yml"):
-        return _of_mapping(read_yaml(path, _LARGEST), path)
+        return _of_mapping(read_yaml(path), path)
     if ending == ".json":
         return _of_mapping(read_json(path, _LARGEST), path)
     if ending == ".xml":

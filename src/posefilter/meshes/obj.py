@@ -1,5 +1,6 @@
 """Read Wavefront OBJ and its materials, with seams in the texture and normals of each corner."""
 
+import os
 import re
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -10,7 +11,7 @@ import numpy as np
 
 from posefilter.errors import UserError
 from posefilter.limits import check_picture, read_bytes
-from posefilter.meshes.polygons import triangulate
+from posefilter.meshes.polygons import Effort, triangulate
 from posefilter.paths import check_inside
 
 
@@ -66,7 +67,7 @@ def read_image(path: Path, source: Path) -> np.ndarray:
     return cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
 
 
-def _read_mtl(path: Path, source: Path, images: dict[Path, np.ndarray]) -> dict[str, Material]:
+def _read_mtl(path: Path, source: Path, images: dict[str, np.ndarray]) -> dict[str, Material]:
     """Read materials; their images, which others may share, are added to `images`."""
     check_inside(path, source.parent)
     if not path.is_file():
@@ -97,14 +98,15 @@ def _read_mtl(path: Path, source: Path, images: dict[Path, np.ndarray]) -> dict[
     gray = {name: rest for name, rest in ambient.items() if np.ptp(materials[name].color) == 0}
     for name, rest in (gray | pictures).items():
         image = path.parent / _skip_options(rest, path).replace("\\", "/")
-        if image not in images:
-            images[image] = read_image(image, path)
+        place = os.path.realpath(image)
+        if place not in images:
+            images[place] = read_image(image, path)
             pixels = sum(one.shape[0] * one.shape[1] for one in images.values())
             if pixels > MOST_TEXELS:
                 raise UserError(
                     f"{path}: too large: textures of {pixels:,} pixels; scale them down"
                 )
-        materials[name] = materials[name]._replace(image=images[image])
+        materials[name] = materials[name]._replace(image=images[place])
     # A picture is shown as it is: exporters leave Kd at any gray beside it.
     return {k: m if m.image is None else m._replace(color=np.ones(3)) for k, m in materials.items()}
 
@@ -116,7 +118,8 @@ def read_obj(path: Path) -> RawMesh:
     face_material: list[int] = []
     polygons: dict[int, list[int]] = {}  # by number of corners: the first triangle of each
     library: dict[str, Material] = {}
-    images: dict[Path, np.ndarray] = {}
+    read: set[str] = set()  # the files of materials
+    images: dict[str, np.ndarray] = {}
     materials: dict[str | None, int] = {}
     current = 0
     for key, rest in _read_lines(path):
@@ -134,7 +137,10 @@ def read_obj(path: Path) -> RawMesh:
             rest = rest[1:-1] if len(rest) > 2 and rest[0] == rest[-1] == '"' else rest
             several = all((path.parent / file).is_file() for file in rest.split())
             for file in rest.split() if several else [rest]:
-                library |= _read_mtl(path.parent / file, path, images)
+                place = os.path.realpath(path.parent / file)
+                if place not in read:  # however often it is named, and how
+                    library |= _read_mtl(path.parent / file, path, images)
+                    read.add(place)
         elif key == "usemtl":
             if face_material and not materials:  # the faces before have none
                 materials[None] = 0
@@ -158,8 +164,9 @@ def read_obj(path: Path) -> RawMesh:
     faces = index[..., 0]
     if len(faces) and (faces.min() < 0 or faces.max() >= len(vertices)):
         raise UserError(f"{path}: a face names a vertex that is not there (is the file cut short?)")
+    effort = Effort()
     for count, firsts in polygons.items():
-        _split(index, vertices, np.array(firsts), count)
+        _split(index, vertices, np.array(firsts), count, effort)
     return RawMesh(
         vertices,
         faces,
@@ -184,22 +191,23 @@ def _skip_options(rest: str, path: Path) -> str:
 
     Raises UserError where these move or repeat the picture, which is not read.
     """
-    while rest.startswith("-"):
-        option, _, rest = rest.partition(" ")
-        words = rest.split()
+    words = [*re.finditer(r"\S+", rest)]
+    at = 0
+    while at < len(words) and (option := words[at][0]).startswith("-"):
+        at += 1
         if option in ("-s", "-o", "-t"):
             count = 0
-            while count < 3 and count < len(words) - 1 and _is_number(words[count]):
+            while count < 3 and at + count < len(words) - 1 and _is_number(words[at + count][0]):
                 count += 1
             neutral = 1.0 if option == "-s" else 0.0
-            if any(float(word) != neutral for word in words[:count]):
+            if any(float(word[0]) != neutral for word in words[at : at + count]):
                 raise UserError(f"{path}: map_Kd with {option}, which is not read; bake it")
         elif option in _OPTIONS:
             count = _OPTIONS[option]
         else:
-            return words[-1] if words else ""
-        rest = rest.split(None, count)[-1] if len(words) > count else ""
-    return rest
+            return words[-1][0] if at < len(words) else ""
+        at += count
+    return rest[words[at].start() :] if at < len(words) else ""
 
 
 def _is_number(word: str) -> bool:
@@ -210,7 +218,9 @@ def _is_number(word: str) -> bool:
     return True
 
 
-def _split(index: np.ndarray, vertices: np.ndarray, firsts: np.ndarray, count: int) -> None:
+def _split(
+    index: np.ndarray, vertices: np.ndarray, firsts: np.ndarray, count: int, effort: Effort
+) -> None:
     """Split polygons, which are fans so far, such that concave ones are covered, too; in place.
 
     Args:
@@ -218,10 +228,11 @@ def _split(index: np.ndarray, vertices: np.ndarray, firsts: np.ndarray, count: i
         vertices: (V, 3).
         firsts: (M,) the first triangle of each polygon.
         count: Corners of each.
+        effort: Of the file.
     """
     rows = firsts[:, None] + np.arange(count - 2)  # (M, n - 2)
     corners = np.concatenate([index[firsts, :2], index[rows, 2]], axis=1)  # (M, n, 3)
-    triangles = triangulate(vertices[corners[..., 0]])
+    triangles = triangulate(vertices[corners[..., 0]], effort)
     index[rows] = corners[np.arange(len(firsts))[:, None, None], triangles]
 
 

@@ -11,7 +11,8 @@ from posefilter.meshes.ply_faces import list_elements, split_faces
 _END = b"end_header"
 _LONGEST = 1 << 20  # of a header [bytes]
 _TEXTURE = re.compile(r"comment\s+texturefile\s+(.+)", re.IGNORECASE)
-_PROPERTY = re.compile(r"^(\s*property\s+.*\s)(\w+)(\s*)$", re.MULTILINE)
+# by blanks that are no ends of lines, and none twice in a row: else the time grows by the square
+_PROPERTY = re.compile(r"^([^\S\n]*property\b.*[^\S\n])(\w+)([^\S\n]*)$", re.MULTILINE)
 COLORS, _WIDE = {"red", "green", "blue"}, ("h", "H")
 _SHORT = {"r": "red", "g": "green", "b": "blue"}
 _COORDINATES = ("texture_u", "texture_v", "u", "v", "s", "t", "texcoord")

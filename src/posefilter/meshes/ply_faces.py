@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from posefilter.meshes.polygons import triangulate
+from posefilter.meshes.polygons import Effort, triangulate
 
 _ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">"}
 # kinds of numbers, as `struct` and numpy name them
@@ -99,17 +99,22 @@ def _split_each(vertices: np.ndarray, faces: Sequence[Sequence[Any]]) -> list[li
 
     (V, 3), the vertices' numbers of each face -> for each face its triangles, none of an edge.
     """
-    sizes = [len(face) for face in faces]
-    triangles = {}
-    for size in set(sizes) - {0, 1, 2}:
-        places = np.array([face for face in faces if len(face) == size], int)
-        triangles[size] = iter(triangulate(vertices[places]).tolist())
-    return [next(triangles[size]) if size > 2 else [] for size in sizes]
+    alike: dict[int, list[Sequence[Any]]] = {}
+    for face in faces:
+        alike.setdefault(len(face), []).append(face)
+    effort = Effort()
+    triangles = {
+        size: iter(triangulate(vertices[np.array(own, int)], effort).tolist())
+        for size, own in alike.items()
+        if size > 2
+    }
+    return [next(triangles[len(face)]) if len(face) > 2 else [] for face in faces]
 
 
 def _count_faces(header: str, count: int) -> str:
     """Return a header that names another number of faces."""
-    return re.sub(r"^(\s*element\s+face\s+)\d+", rf"\g<1>{count}", header, flags=re.MULTILINE)
+    named = r"^([^\S\n]*element[^\S\n]+face[^\S\n]+)\d+"
+    return re.sub(named, rf"\g<1>{count}", header, flags=re.MULTILINE)
 
 
 def _split_text(header: str, body: bytes, vertex: Element, face: Element) -> tuple[str, bytes]:

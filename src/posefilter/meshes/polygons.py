@@ -2,15 +2,31 @@
 
 import numpy as np
 
-_MOST_WORK = 1e7  # squared corners of concave polygons, together
+_MOST_WORK = 1e7  # squared corners of concave polygons of one size, together
+_MOST_TRIED = 2e8  # corners that the ears of a file's polygons are compared with: half a minute
+_OVERHEAD = 100  # of a comparison, in corners
 _FLAT = 1e-9  # of a polygon's area: a corner that turns back by less is straight
 
 
-def triangulate(points: np.ndarray) -> np.ndarray:
+class Effort:
+    """What is spent on the concave polygons of a file: some take the cube of their corners."""
+
+    def __init__(self) -> None:
+        self._tried = 0
+
+    def spend(self, corners: int) -> None:
+        """Count corners that one was compared with.  Raises ValueError where they are too many."""
+        self._tried += corners
+        if self._tried > _MOST_TRIED:
+            raise ValueError("concave faces that take too long to split; triangulate them")
+
+
+def triangulate(points: np.ndarray, effort: Effort | None = None) -> np.ndarray:
     """Split polygons of the same number of corners: convex ones as fans, others by clipping ears.
 
     Args:
         points: (M, n, 3) corners in their order; nearly flat, and without crossing themselves.
+        effort: Of the file that they are in; None: its own.
 
     Returns:
         (M, n - 2, 3) which corners make the triangles, in the polygon's sense of rotation.
@@ -25,8 +41,9 @@ def triangulate(points: np.ndarray) -> np.ndarray:
     concave = np.flatnonzero(_find_concave(points))
     if len(concave) * count**2 > _MOST_WORK:
         raise ValueError(f"{len(concave):,} concave faces of {count:,} corners; triangulate them")
+    effort = effort or Effort()
     for one in concave:
-        out[one] = _clip_ears(_flatten(points[one]))
+        out[one] = _clip_ears(_flatten(points[one]), effort)
     return out
 
 
@@ -57,25 +74,27 @@ def _flatten(points: np.ndarray) -> np.ndarray:
     return (points - points[0]) @ basis.T
 
 
-def _clip_ears(flat: np.ndarray) -> np.ndarray:
+def _clip_ears(flat: np.ndarray, effort: Effort) -> np.ndarray:
     """Split a counter-clockwise polygon (n, 2).  -> (n - 2, 3)."""
     left = list(range(len(flat)))
     out = []
     while len(left) > 3:
-        ear = next((at for at in range(len(left)) if _is_ear(flat, left, at)), 0)
+        ear = next((at for at in range(len(left)) if _is_ear(flat, left, at, effort)), 0)
         out.append((left[ear - 1], left[ear], left[(ear + 1) % len(left)]))
         del left[ear]
     return np.array([*out, left])
 
 
-def _is_ear(flat: np.ndarray, left: list[int], at: int) -> bool:
+def _is_ear(flat: np.ndarray, left: list[int], at: int, effort: Effort) -> bool:
     """Return whether the corner is convex, and no other lies in its triangle."""
     names = [left[at - 1], left[at], left[(at + 1) % len(left)]]
+    effort.spend(_OVERHEAD)
     a, b, c = flat[names]
     if (a == b).all():
         return True
     if _cross(b - a, c - b) <= 0:
         return False
+    effort.spend(len(left))
     others = flat[[one for one in left if one not in names]]
     # corners that share a place with one of the triangle's do not lie in it: holes are cut so
     apart = (others[:, None] != np.stack([a, b, c])).any(-1).all(-1)

@@ -12,6 +12,7 @@ from posefilter.files import open_whole_text
 from posefilter.forms import MOST
 from posefilter.limits import open_text
 from posefilter.metrics.scores import InstanceErrors, summarize_errors
+from posefilter.paths import name_in_table
 
 FILE = "errors.csv"
 
@@ -51,7 +52,7 @@ def write_errors(path: Path, rows: Sequence[ImageError]) -> None:
     with open_whole_text(path) as file:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(ImageError._fields)
-        writer.writerows(rows)
+        writer.writerows(row._replace(image=name_in_table(row.image)) for row in rows)
 
 
 def read_errors(path: Path) -> list[ImageError]:

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from posefilter import limits
-from posefilter.errors import UserError
+from posefilter.errors import UserError, printable
 from posefilter.forms import NUMBER, TEXT, Each, Record, check_form, parse_json
 from posefilter.metrics.image_errors import FILE, ImageError
 from posefilter.report.events import (
@@ -22,7 +22,7 @@ from posefilter.report.image_errors import read_image_errors
 from posefilter.report.images import StoredImage, read_images
 
 MARKS = ("metrics.json", ".hydra/config.yaml")
-_MOST_YAML, _MOST_JSON = 1 << 20, 1 << 26  # [bytes]
+_MOST_JSON = 1 << 26  # [bytes]
 SWEEP_MARKS = ("multirun.yaml", "summary.csv")
 _NO_ERRORS = "No errors.csv: what the test found in single images is not known."
 
@@ -153,7 +153,8 @@ def read_metrics(path: Path) -> dict[str, Any]:
     ends = r"\d+(\.\d+)?"
     for name in metrics.get("by_visibility") or {}:
         if not re.fullmatch(f"{ends}-{ends}", name):
-            raise UserError(f"{path}: its by_visibility should have ranges, as 0.3-0.5: {name:.40}")
+            said = f"its by_visibility should have ranges, as 0.3-0.5: {printable(name[:40])}"
+            raise UserError(f"{path}: {said}")
     found = metrics.get("credibility") or {}
     curves = [found.get("all"), *(one["coverage"] for one in found.get("quarters") or ())]
     levels = found.get("levels")
@@ -211,7 +212,7 @@ def read_yaml(path: Path) -> dict[str, Any]:
     """
     if not path.is_file():
         return {}
-    content = limits.read_yaml(path, _MOST_YAML)
+    content = limits.read_yaml(path)
     if not isinstance(content, dict):
         raise UserError(f"{path}: should hold one mapping")
     return content

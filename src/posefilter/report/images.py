@@ -8,10 +8,10 @@ from io import BytesIO
 from pathlib import Path
 from typing import NamedTuple
 
-from PIL import Image, UnidentifiedImageError
+from PIL import UnidentifiedImageError
 
 from posefilter.errors import BadData
-from posefilter.limits import MOST_BYTES, check_picture, read_bytes
+from posefilter.limits import MOST_BYTES, check_picture, open_picture, read_bytes
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".gif")
 SECTIONS = {  # the first whose words a picture's name has; what is in none is "more"
@@ -59,7 +59,9 @@ def read_images(folder: Path) -> list[StoredImage]:
 
 def sort_by_number(name: str) -> list[tuple[int, str]]:
     """Return a sorting key in which 2 comes before 10."""
-    return [(int(part), "") if part.isdigit() else (-1, part) for part in re.split(r"(\d+)", name)]
+    return [
+        (int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"(\d+)", name)
+    ]
 
 
 def group_by_section(pictures: list[StoredImage]) -> dict[str, list[StoredImage]]:
@@ -80,7 +82,7 @@ def encode_image(data: bytes) -> tuple[str, int, int]:
     """
     try:
         check_picture(Path("picture"), data)
-        with Image.open(BytesIO(data)) as image:
+        with open_picture(data) as image:
             kind, (width, height) = (image.format or "").lower(), image.size
             if len(data) > KEPT_BYTES and getattr(image, "n_frames", 1) == 1:
                 image.thumbnail((LARGEST_PX, LARGEST_PX))

@@ -95,7 +95,7 @@ def make_health_panels(curves: Mapping[str, Curve]) -> list[Panel]:
     """
     found: dict[str, dict[int, float]] = {}
     for tag, curve in curves.items():
-        match = re.fullmatch(r"filter/(\w+)/step_(\d+)", tag)
+        match = re.fullmatch(r"filter/(\w+)/step_(\d{1,9})", tag)
         if match:
             found.setdefault(match[1], {})[int(match[2])] = curve.values[-1]
     out = []

@@ -25,6 +25,7 @@ from posefilter.locks import LOCK, hold, release
 from posefilter.meshes.mesh import Mesh
 from posefilter.meshes.parts import split_part
 from posefilter.meshes.store import BUILTIN, MeshStore
+from posefilter.paths import check_links
 from posefilter.ranges import check_ranges
 from posefilter.synthetic import fat_format as fat
 from posefilter.synthetic.frame_renderer import Job, make_renderer
@@ -423,6 +424,7 @@ def _open_dataset(out: Path, job: Job, frames: int, mesh: Mesh | None) -> None:
     digest = None if mesh is None else digest_mesh(mesh)
     colors = None if mesh is None else summarize_print(mesh)
     if record is not None:
+        check_links(out)  # before anything is removed: somebody else may have begun it
         differing = _list_differing(record.settings, settings)
         if not any(out.glob("mixed/*/[0-9]*.json")):
             # an earlier start failed before its first frame: nothing is kept of it

@@ -17,6 +17,7 @@ from posefilter.files import open_whole_text
 from posefilter.metrics.errors import add, add_s
 from posefilter.metrics.scores import summarize
 from posefilter.metrics.tracks import find_gaps, measure_jitter
+from posefilter.paths import name_in_table
 from posefilter.tracking.track import TrackResult
 from posefilter.types import ObjectModel
 
@@ -185,7 +186,10 @@ def write_rows(folder: Path, rows: Sequence[dict[str, Any]]) -> None:
     with open_whole_text(folder / "tracks.csv") as file:
         writer = csv.DictWriter(file, _COLUMNS, extrasaction="ignore", lineterminator="\n")
         writer.writeheader()
-        writer.writerows(rows)
+        names = ("video", "frame")
+        writer.writerows(
+            row | {name: name_in_table(str(row[name])) for name in names} for row in rows
+        )
 
 
 def format_row(row: dict[str, Any]) -> str:

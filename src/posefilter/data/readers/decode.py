@@ -10,11 +10,11 @@ from typing import Any
 
 import cv2
 import numpy as np
-from PIL import ExifTags, Image
+from PIL import ExifTags
 
 from posefilter.data.frames import SATURATED
 from posefilter.errors import BadData
-from posefilter.limits import check_picture, read_bytes
+from posefilter.limits import check_picture, open_picture, read_bytes
 
 _TURNS = range(2, 9)  # of EXIF; 1: none
 _DEPTH_ALONE = {b"\x93NUMPY": "an array", b"PK\x03\x04": "an archive", b"v/1\x01": "an EXR"}
@@ -39,7 +39,7 @@ def read_color(path: Path) -> np.ndarray:
     if image.ndim == 2:
         return np.repeat(image[..., None], 3, axis=-1)
     if image.shape[2] == 4 and data.startswith(_TIFF):  # OpenCV has multiplied by alpha
-        with Image.open(io.BytesIO(data)) as whole:
+        with open_picture(data) as whole:
             return np.array(whole.convert("RGBA"))[..., :3].copy()
     return np.ascontiguousarray(image[..., 2::-1])
 
@@ -48,7 +48,7 @@ def read_size(path: Path) -> tuple[int, int]:
     """Return height and width of an image, by its header."""
     data = read_bytes(path)
     check_picture(path, data)
-    with Image.open(io.BytesIO(data)) as image:
+    with open_picture(data) as image:
         return image.height, image.width
 
 
@@ -117,7 +117,7 @@ def read_label(path: Path) -> np.ndarray:
     data = read_bytes(path)
     image = decode_image(data, path)
     if data.startswith(_PNG) and data[25:26] == _PALETTE:  # OpenCV has put colors for the indices
-        with Image.open(io.BytesIO(data)) as indices:
+        with open_picture(data) as indices:
             return np.array(indices)
     if image.ndim == 3 and (image == image[..., :1]).all():
         image = image[..., 0]
@@ -244,7 +244,7 @@ def _check_upright(data: bytes, path: Path) -> None:
     """
     if data[:2] != _JPEG or b"Exif\0\0" not in data[: 1 << 16]:
         return
-    with Image.open(io.BytesIO(data)) as image:
+    with open_picture(data) as image:
         turned = image.getexif().get(ExifTags.Base.Orientation, 1)
     if turned in _TURNS:
         advice = "save it as it is shown, with depth and intrinsics to match"
