@@ -53,7 +53,14 @@ def read_bytes(path: Path, max_bytes: int = MOST_BYTES) -> bytes:
         size = path.stat().st_size
         if size > max_bytes:
             raise BadData(path, "file too large", f"{size:,} bytes, at most {max_bytes:,}")
-        return path.read_bytes()
+        with path.open("rb") as file:
+            data = file.read(size)
+            # it grows, or its system tells no size
+            while len(data) <= max_bytes and (more := file.read(1 << 20)):
+                data += more
+        if len(data) > max_bytes:
+            raise BadData(path, "file too large", f"at most {max_bytes:,} bytes")
+        return data
     except OSError as error:
         raise BadData(path, "cannot be read", error.strerror or type(error).__name__) from error
 

@@ -29,7 +29,8 @@ from posefilter.data.generated_scenes import ensure_scenes
 from posefilter.data.points import read_model_points
 from posefilter.data.readers.decode import read_color, read_size
 from posefilter.data.readers.ycb_video_files import read_meta
-from posefilter.errors import UserError
+from posefilter.errors import BadData, UserError
+from posefilter.limits import read_bytes
 from posefilter.meshes import obj, polygons
 from posefilter.meshes.files import read_mesh
 from posefilter.meshes.symmetries import read_symmetries
@@ -547,3 +548,11 @@ def test_a_packed_array_is_not_unpacked_without_end(order: str, tmp_path: Path) 
     path = tmp_path / "000001-meta.mat"
     path.write_bytes(text + struct.pack(f"{order}2I", 15, len(packed)) + packed)
     assert "not readable as a MATLAB file" in refuse(lambda: read_meta(path))
+
+
+def test_no_more_is_read_of_a_file_that_tells_no_size() -> None:
+    path = Path("/proc/self/environ")  # its size is told as 0, as that of a file which grows later
+    if not path.is_file() or len(path.read_bytes()) < 3:
+        pytest.skip("there is no such file on this system")
+    with pytest.raises(BadData, match="file too large .at most 2 bytes"):
+        read_bytes(path, 2)
