@@ -120,7 +120,7 @@ class Estimator:
             instances: How many of each object an image shows at most: a number, or one for each
                 name, 1 for those left out.  None: one answer an object, whatever it covers.
             seed: Decides every random draw of the filter: the same images and seed give the same
-                answer.
+                answer.  An image has other draws in a batch than alone.
 
         Returns:
             A `Result` where one image is given and one object was loaded; a list of them, an
