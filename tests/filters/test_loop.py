@@ -258,6 +258,30 @@ def test_a_dead_filter_says_so(bad: float) -> None:
         build()(None, Broken(GOALS), Generator().manual_seed(0))
 
 
+@pytest.mark.parametrize("resample", [EnsembleTransform(), AdaptiveResampling(EnsembleTransform())])
+def test_a_particle_of_likelihood_zero_has_no_part_in_a_mixture(resample: Resample) -> None:
+    """Likelihoods are 1 or 0, so that the ratio of a child's to its ancestors' is that, too."""
+
+    class Half(Hill):
+        def measure(
+            self, encoding: Tensor, particles: Particles, step: Step, generator: Generator
+        ) -> ParticleOutput:
+            output = super().measure(encoding, particles, step, generator)
+            away = particles.state[..., 0] > encoding[:, None, 0]
+            log_p = torch.zeros_like(output.log_likelihood).masked_fill(away, -math.inf)
+            return output._replace(log_likelihood=log_p)
+
+    trace = build(resample, propagate=Identity(), reweight=LikelihoodRatio())(
+        None, Half(GOALS), Generator().manual_seed(0)
+    )
+    assert trace.log_evidence is not None
+    assert bool((trace.log_evidence[:, 0] < -0.1).all())  # some are away
+    torch.testing.assert_close(
+        trace.log_evidence[:, 1:], torch.zeros_like(trace.log_evidence[:, 1:]), atol=0.3, rtol=0
+    )
+    assert bool(trace.belief.best.isfinite().all())
+
+
 def test_annealed_weights_are_the_last_scores_alone() -> None:
     trace = build(
         AdaptiveResampling(Systematic(), 0.3), reweight=CurrentLikelihood(), estimate=Argmax()

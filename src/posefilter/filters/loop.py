@@ -209,6 +209,9 @@ class ParticleFilter(nn.Module):
                 generator,
             )
             latent = inherit(latent, resampled)
+            if resampled.mixture_weights is not None:
+                # a particle of likelihood 0 has no weight, so no part in a mixture; 0 * inf is NaN
+                log_likelihood = log_likelihood.masked_fill(log_likelihood.isneginf(), 0.0)
             before = inherit(log_likelihood[..., None], resampled)[..., 0]
             return moved, latent, resampled.log_weights, resampled.ancestors, before
 
