@@ -81,7 +81,7 @@ def cache(path: Path) -> None:
 
 
 ROW = PoseRow(1, 2, 3, 0.5, np.eye(4), 0.1)
-ERROR = ImageError(*([0.5] * len(ImageError._fields)))  # type: ignore[arg-type]
+ERROR = ImageError(*([0.5] * len(ImageError._fields)))._replace(image="a.png")  # type: ignore[arg-type]
 WRITERS: dict[str, Callable[[Path], object]] = {
     "checkpoint": lambda path: save_whole({"w": torch.rand(100_000)}, path),
     "belief": belief,
