@@ -9,7 +9,7 @@ from omegaconf import OmegaConf
 
 from posefilter.cli import run_command
 from posefilter.cli.folders import KeepResults, keep_training_results, move_evaluation, own_metrics
-from posefilter.cli.predict import remove_answers
+from posefilter.cli.predict import find_photograph, remove_answers
 from posefilter.errors import UserError
 
 HOME = Path(__file__).parents[2]
@@ -211,3 +211,21 @@ def test_of_an_answer_before_nothing_is_left(tmp_path: Path) -> None:
     remove_answers(tmp_path)
     assert (tmp_path / "poses.csv").exists()
     assert (tmp_path / "view.rrd").exists()
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "found"),
+    [
+        ("pose.json", '{"rgb": "a.png"}', "a.png"),
+        ("poses.json", '[{"rgb": "b.png"}, {"rgb": "b.png"}]', "b.png"),
+        ("poses.json", "[]", ""),
+        ("pose.json", '{"rgb": 3}', ""),
+        ("pose.json", "", ""),
+        ("other.json", '{"rgb": "a.png"}', ""),
+    ],
+)
+def test_the_photograph_of_an_answer_before_is_found(
+    name: str, content: str, found: str, tmp_path: Path
+) -> None:
+    (tmp_path / name).write_text(content)
+    assert find_photograph(tmp_path) == found

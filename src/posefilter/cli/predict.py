@@ -13,7 +13,7 @@ from omegaconf import DictConfig, ListConfig
 
 from posefilter.cli.checkpoints import check_once, method_of, methods_of, read_checkpoint
 from posefilter.cli.components import changes
-from posefilter.cli.console import JSON, ended
+from posefilter.cli.console import JSON, ended, say
 from posefilter.cli.job import Job
 from posefilter.cli.machine import settle
 from posefilter.cli.plain import key_of
@@ -34,6 +34,7 @@ from posefilter.figures.view_data import collect_view_data
 from posefilter.geometry.camera import find_matrix_flaw
 from posefilter.geometry.lens import read_distortion, undistort_most
 from posefilter.images import check_images, drop_unknown
+from posefilter.limits import read_json
 from posefilter.meshes.ycb import number_objects
 from posefilter.metrics.bop_results import PoseRow, choose_score, write_poses_csv
 from posefilter.result import Result, collect_results
@@ -99,7 +100,7 @@ def predict_one(job: Job) -> list[Result]:
     (run,) = estimator.run(images, cfg.seed)
     ((result,),) = collect_results([run], costs, tolerance)
     folder.mkdir(parents=True, exist_ok=True)
-    remove_answers(folder)
+    replace_answers(job)
     save_image(result.draw_overlay(rgb, K, shape), folder / "overlay.png")
     band = folder / "band.png"
     if result.verdict != "absent":
@@ -146,7 +147,7 @@ def predict_several(job: Job) -> list[Result]:
     seen = [one for one in results if one.verdict != "absent"]
     absent = [name for name in estimator.objects if name not in {one.object for one in seen}]
     drawn = [mark_result(one, load_shape(store, one.object_model)) for one in seen]
-    remove_answers(folder)
+    replace_answers(job)
     beliefs = folder / "beliefs"
     beliefs.mkdir(parents=True, exist_ok=True)
     save_image(draw_detections(rgb, K, drawn, absent), folder / "overlay.png")
@@ -173,6 +174,26 @@ def predict_several(job: Job) -> list[Result]:
     files |= {"overlay": folder / "overlay.png", "beliefs": beliefs}
     ended(cfg.console, "predicted", files, [], poses=answers)
     return results
+
+
+def replace_answers(job: Job) -> None:
+    """Remove the files of an earlier answer, with a line where it was on another photograph."""
+    earlier, folder = find_photograph(job.folder), job.folder
+    remove_answers(folder)
+    if earlier not in ("", str(job.cfg.rgb)):
+        line = f"{folder}: the answer on {earlier} is replaced; out=DIR would keep both"
+        say(job.cfg.console, "replaced", line, folder=str(folder), rgb=earlier)
+
+
+def find_photograph(folder: Path) -> str:
+    """Return the photograph that a folder's answer is on, "" where there is none."""
+    for mark, *_ in (_ALONE, _SEVERAL):
+        with suppress(UserError):  # it is missing, or none of ours
+            content = read_json(folder / mark)
+            first = content[0] if isinstance(content, list) and content else content
+            if isinstance(first, dict) and isinstance(first.get("rgb"), str):
+                return str(first["rgb"])
+    return ""
 
 
 def remove_answers(folder: Path) -> None:
