@@ -225,6 +225,8 @@ def test_typed_matrices_are_judged_as_those_of_files_are() -> None:
         ({"intrinsics": FOUR, "distortion": [0.1, -0.2, 0, 0, 0]}, "0.1,-0.2,0,0,0"),
         (FOUR | {"p2": 0.01, "k1": 0.1, "k3": 0.2}, "0.1,0,0,0.01,0.2"),
         (FOUR | {"distortion": {"k1": 0.1, "k6": 0.3}}, "0.1,0,0,0,0,0,0,0.3"),
+        (FOUR | {"k2": 0.1}, "0,0.1,0,0,0"),
+        (FOUR | {"K1": 0.1, "P1": [0] * 12}, "0.1,0,0,0,0"),
         (FOUR | {"dist_coeff": [[0.1, -0.2, 0, 0]]}, "0.1,-0.2,0,0"),
         (FOUR | {"distCoeffs": [[0.1], [-0.2], [0], [0]]}, "0.1,-0.2,0,0"),
         (NERF | {"k1": 0.1, "p2": 0.3}, "0.1,0,0,0.3,0"),
@@ -237,6 +239,81 @@ def test_a_distortion_is_found_where_it_is_told(content: Any, told: str, tmp_pat
     path.write_text(json.dumps(content))
     with pytest.raises(UserError, match=f"distortion={told}$"):
         read_intrinsics(str(path))
+
+
+@pytest.mark.parametrize(
+    ("content", "told"),
+    [
+        (NERF | {"frames": [{"fl_x": 600.0}]}, "has another camera for each image"),
+        ({"camera_angle_x": 0.7, "frames": []}, "has an angle of view, and no fx, fy, cx, cy"),
+        (FOUR | {"k0": 0.1}, "'k0' is a distortion in a form that is not read"),
+        (FOUR | {"distortion": {"radial": [0.1, 0.2]}}, "'distortion' is a distortion in a form"),
+        (FOUR | {"distortion": {"k1": 0, "b": [0.2]}}, "'distortion' is a distortion in a form"),
+    ],
+)
+def test_what_would_be_read_in_part_is_refused(content: Any, told: str, tmp_path: Path) -> None:
+    path = tmp_path / "camera.json"
+    path.write_text(json.dumps(content))
+    with pytest.raises(BadData, match=rf"camera\.json: {told}"):
+        read_camera_file(path)
+
+
+@pytest.mark.parametrize(
+    ("content", "model"),
+    [
+        (NERF | {"camera_model": "OPENCV_FISHEYE"}, "OPENCV_FISHEYE"),
+        (NERF | {"k4": 0.1}, "NeRF's k4"),
+        (FOUR | {"model": "equidistant", "D": [0] * 4}, "equidistant"),
+        (FOUR | {"model": "Kannala_Brandt4"}, "Kannala_Brandt4"),
+        (
+            FOUR | {"camera_model": "omni", "distortion_model": "radtan", "D": [0.1, 0, 0, 0]},
+            "omni",
+        ),
+    ],
+)
+def test_a_lens_that_is_no_pinhole_is_none_where_its_coefficients_are_0(
+    content: Any, model: str, tmp_path: Path
+) -> None:
+    path = tmp_path / "camera.json"
+    path.write_text(json.dumps(content))
+    for distorted in (False, True):  # typed beside the file, or not
+        with pytest.raises(UserError, match=rf"tells a distortion \({model}\)"):
+            read_intrinsics(str(path), distorted)
+
+
+@pytest.mark.parametrize(
+    ("line", "fy", "distortion"),
+    [
+        ("PINHOLE 640 480 600 601 320 240", 601, ()),
+        ("SIMPLE_PINHOLE 640 480 600 320 240", 600, ()),
+        ("SIMPLE_RADIAL 640 480 600 320 240 0.1", 600, (0.1, 0, 0, 0, 0)),
+        ("RADIAL 640 480 600 320 240 0.1 -0.2", 600, (0.1, -0.2, 0, 0, 0)),
+        ("OPENCV 640 480 600 601 320 240 0.1 -0.2 0.3 0.4", 601, (0.1, -0.2, 0.3, 0.4, 0)),
+    ],
+)
+def test_a_camera_of_colmap_is_read(
+    line: str, fy: float, distortion: tuple[float, ...], tmp_path: Path
+) -> None:
+    """The center of COLMAP's first pixel is at 0.5, not at 0."""
+    path = tmp_path / "cameras.txt"
+    path.write_text(f"# CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]\n1 {line}\n")
+    camera = read_camera_file(path)
+    np.testing.assert_array_equal(camera.K, [[600, 0, 319.5], [0, fy, 239.5], [0, 0, 1]])
+    assert (camera.size, camera.distortion) == (SIZE, distortion)
+
+
+@pytest.mark.parametrize(
+    ("content", "told"),
+    [
+        ("1 OPENCV_FISHEYE 640 480 6 6 3 2 0 0 0 0", "camera model OPENCV_FISHEYE is not read"),
+        ("1 PINHOLE 640 480 6 6 3 2\n2 PINHOLE 640 480 6 6 3 2", "several cameras: 2 lines"),
+        ("1 PINHOLE 640 480 6 6 3", "'parameters' has the wrong size"),
+    ],
+)
+def test_other_cameras_of_colmap_are_refused(content: str, told: str, tmp_path: Path) -> None:
+    (tmp_path / "cameras.txt").write_text(content)
+    with pytest.raises(BadData, match=told):
+        read_camera_file(tmp_path / "cameras.txt")
 
 
 def test_a_distortion_of_another_form_is_refused(tmp_path: Path) -> None:

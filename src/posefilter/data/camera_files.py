@@ -32,6 +32,21 @@ _POLYNOMIALS = (
     "", "none", "plumb_bob", "rational_polynomial", "brown_conrady", "radtan",
     "radial-tangential", "opencv", "pinhole",
 )  # fmt: skip
+# kinds whose images are no pinhole's even where all coefficients are 0
+_WIDE = re.compile(
+    ".*(fisheye|equi(dist|rect|solid)|kannala|spherical|panora|f_?theta).*"
+    "|omni(directional)?|e?ucm|mei|ds|fov"
+)
+# parameters of COLMAP's models; f stands for fx and fy
+_COLMAP = {
+    "SIMPLE_PINHOLE": ("f", "cx", "cy"),
+    "PINHOLE": ("fx", "fy", "cx", "cy"),
+    "SIMPLE_RADIAL": ("f", "cx", "cy", "k1"),
+    "RADIAL": ("f", "cx", "cy", "k1", "k2"),
+    "OPENCV": ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2"),
+    "FULL_OPENCV": ("fx", "fy", "cx", "cy", *_NAMES),
+}
+_COLMAP_LINE = re.compile(r"\s*\d+\s+[A-Z][A-Z_0-9]+\s+\d+\s+\d+\s.*")
 # keys of an image's size, as `_plain` has them
 _SIZES = (("width", "height"), ("imagewidth", "imageheight"), ("imgwidth", "imgheight"), ("w", "h"))
 _BOTH_SIDES = ("imagesize", "imgsize", "resolution", "imageresolution", "size")
@@ -56,8 +71,8 @@ def read_camera_file(path: Path) -> CameraFile:
     Known are fx, fy, cx, cy by name (BOP's `camera.json`, RealSense with ppx, ppy), a matrix of
     nine numbers, by rows or by columns (Open3D), ROS's camera_info and its calibration files,
     OpenCV's FileStorage (YAML, JSON, XML), Kalibr's and EuRoC's YAML of one pinhole camera, NeRF's
-    `transforms.json` with fl_x, fl_y, cx, cy, and BOP's `scene_camera.json` where all images have
-    one camera.
+    `transforms.json` with fl_x, fl_y, cx, cy, COLMAP's `cameras.txt` of one camera, and BOP's
+    `scene_camera.json` where all images have one camera.
 
     Raises:
         BadData: The file is missing, of none of these forms, or no camera's.
@@ -76,6 +91,8 @@ def read_camera_file(path: Path) -> CameraFile:
         words = read_array(path).ravel()
     else:
         lines = [line for line in read_lines(path) if not line.startswith("#")]
+        if any(map(_COLMAP_LINE.fullmatch, lines)):
+            return _of_colmap(lines, path)
         words = " ".join(lines).translate(str.maketrans(",;[]()", "      ")).split()
     found = {"numbers": words}
     if len(words) == 4:
@@ -84,6 +101,25 @@ def read_camera_file(path: Path) -> CameraFile:
         return CameraFile(_orient(numbers(found, "numbers", path, (3, 3)), path))
     expected = "a matrix (3, 3), or fx, fy, cx, cy"
     raise BadData(path, "holds no camera", f"{len(words)} words; expected {expected}")
+
+
+def _of_colmap(lines: list[str], path: Path) -> CameraFile:
+    """Return the camera of a line `ID MODEL WIDTH HEIGHT PARAMETERS` of COLMAP's file."""
+    cameras = [line.split() for line in lines if line.strip()]
+    if len(cameras) > 1:
+        raise BadData(path, f"holds several cameras: {len(cameras)} lines", "keep one of them")
+    _, model, width, height, *values = cameras[0]
+    names = _COLMAP.get(model)
+    if names is None:
+        advice = "rectify the images, and type fx,fy,cx,cy of the rectified"
+        raise BadData(path, f"COLMAP's camera model {model[:40]} is not read", advice)
+    found = numbers({"parameters": values}, "parameters", path, (len(names),)).tolist()
+    content = dict(zip(names, found, strict=True)) | {"width": width, "height": height}
+    if "f" in content:
+        content["fx"] = content["fy"] = content.pop("f")
+    # COLMAP has the center of the first pixel at 0.5, OpenCV has it at 0
+    content |= {"cx": content["cx"] - 0.5, "cy": content["cy"] - 0.5}
+    return _of_mapping(content, path)
 
 
 def _read_xml(path: Path) -> dict[str, Any]:
@@ -126,6 +162,7 @@ def _of_mapping(content: Any, path: Path) -> CameraFile:
     kalibr = [key for key in content if re.fullmatch(r"cam\d+", str(key))]
     if len(kalibr) > 1:
         raise BadData(path, f"holds several cameras: {', '.join(kalibr)}", "keep one of them")
+    _refuse_cameras_of_frames(content, path)
     names = (*kalibr, *_INNER)
     inner = (content[key] for key in names if isinstance(content.get(key), Mapping))
     for one in (content, *inner):
@@ -143,13 +180,26 @@ def _of_mapping(content: Any, path: Path) -> CameraFile:
     raise BadData(path, "holds no camera", f"expected fx, fy, cx, cy or a matrix; it has {some}")
 
 
+def _refuse_cameras_of_frames(content: Mapping[str, Any], path: Path) -> None:
+    """Raise BadData where a `transforms.json` has cameras in its frames, or an angle alone."""
+    frames, focal = content.get("frames"), {"fl_x", "fl_y", "fx", "fy"}
+    if isinstance(frames, list) and any(
+        isinstance(one, Mapping) and focal & one.keys() for one in frames
+    ):
+        raise BadData(path, "has another camera for each image", "type its numbers")
+    if "camera_angle_x" in content and not focal & content.keys():
+        advice = "fx is w / 2 / tan(camera_angle_x / 2): type fx,fy,cx,cy"
+        raise BadData(path, "has an angle of view, and no fx, fy, cx, cy", advice)
+
+
 def _of_camera(content: Mapping[str, Any], K: np.ndarray, path: Path) -> CameraFile:
     """Return a camera with what a mapping says beside its matrix."""
     size = _find_image_size(content, K, path)
     distortion = _listed(content, [key for key in content if _DISTORTION.fullmatch(_plain(key))])
     if distortion is None:
-        _refuse_other_distortion(content, path)
         coefficients = _find_named(content, path)
+        if not any(coefficients):
+            _refuse_other_distortion(content, path)
     else:
         count = np.asarray(distortion["data"], dtype=object).size
         coefficients = tuple(numbers(distortion, "data", path, (count,)).tolist())
@@ -157,9 +207,10 @@ def _of_camera(content: Mapping[str, Any], K: np.ndarray, path: Path) -> CameraF
     P = None if projection is None else numbers(projection, "data", path, (3, 4))
     rectified = None if P is None or P[0, 0] <= 0 else P[:, :3]
     scale = _find_scale(content, path)
-    if not any(coefficients):
+    other = _find_other_model(content)
+    if not any(coefficients) and not _WIDE.fullmatch(other.lower()):
         return CameraFile(K, size, rectified=rectified, depth_scales=scale)
-    return CameraFile(K, size, coefficients, _find_other_model(content), rectified, scale)
+    return CameraFile(K, size, coefficients or (0.0,), other, rectified, scale)
 
 
 def _plain(key: Any) -> str:
@@ -194,11 +245,21 @@ def _find_image_size(
 def _refuse_other_distortion(content: Mapping[str, Any], path: Path) -> None:
     """Raise BadData where a mapping has numbers of a distortion in a form that is not read."""
     for key, value in content.items():
-        if not (isinstance(value, list) and "distortion" in _plain(key)):
-            continue
-        if np.any(numbers(content, key, path, (np.asarray(value, dtype=object).size,))):
+        plain = _plain(key)
+        # k0 is the first coefficient of formats that count from 0
+        is_distortion = "distortion" in plain or _DISTORTION.fullmatch(plain) or plain == "k0"
+        if is_distortion and _has_number(value):
             advice = "of rectified images type fx,fy,cx,cy, of raw ones distortion=, too"
             raise BadData(path, f"'{key}' is a distortion in a form that is not read", advice)
+
+
+def _has_number(value: Any) -> bool:
+    """Tell whether a value, or one within it, is a number other than 0."""
+    if isinstance(value, Mapping):
+        return any(map(_has_number, value.values()))
+    if isinstance(value, list):
+        return any(map(_has_number, value))
+    return isinstance(value, int | float) and not isinstance(value, bool) and value != 0
 
 
 def _find_scale(content: Mapping[str, Any], path: Path) -> tuple[float, ...]:
@@ -217,8 +278,14 @@ def _find_named(content: Mapping[str, Any], path: Path) -> tuple[float, ...]:
         if _DISTORTION.fullmatch(_plain(key)) and isinstance(value, Mapping)
     )
     for one in (content, *inner):
-        if "k1" in one:
-            own = {name: one.get(name, 0.0) for name in _NAMES}
+        # lists by such names are other things: P1 is a projection of KITTI's, K1 a matrix
+        keys = {
+            _plain(key): key
+            for key, value in one.items()
+            if key in _NAMES or not isinstance(value, list | Mapping)
+        }
+        if not keys.keys().isdisjoint(_NAMES):
+            own = {name: one[keys[name]] if name in keys else 0.0 for name in _NAMES}
             found = tuple(float(numbers(own, name, path, ())) for name in _NAMES)
             return found if any(found[5:]) else found[:5]
     return ()
@@ -228,6 +295,11 @@ def _find_other_model(content: Mapping[str, Any]) -> str:
     """Return the kind of distortion that a mapping names, "" where it is OpenCV's polynomial, or
     names none.
     """
+    camera = str(content.get("camera_model", ""))
+    if _WIDE.fullmatch(camera.lower()):  # whatever the distortion on top of it is
+        return camera
+    if "fl_x" in content and _has_number(content.get("k4")):
+        return "NeRF's k4"  # the factor of r^8; OpenCV's k4 is of a denominator
     named = next((str(content[key]) for key in _MODELS if content.get(key) is not None), "")
     plain = named.lower().removeprefix("distortion.").replace(" ", "_")  # as RealSense's tools do
     return "" if plain in _POLYNOMIALS else named
