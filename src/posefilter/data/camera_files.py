@@ -255,11 +255,16 @@ def _refuse_other_distortion(content: Mapping[str, Any], path: Path) -> None:
 
 def _has_number(value: Any) -> bool:
     """Tell whether a value, or one within it, is a number other than 0."""
-    if isinstance(value, Mapping):
-        return any(map(_has_number, value.values()))
-    if isinstance(value, list):
-        return any(map(_has_number, value))
-    return isinstance(value, int | float) and not isinstance(value, bool) and value != 0
+    left = [value]  # without recursion, however deep a file is
+    while left:
+        one = left.pop()
+        if isinstance(one, Mapping):
+            left += one.values()
+        elif isinstance(one, list):
+            left += one
+        elif isinstance(one, int | float) and not isinstance(one, bool) and one != 0:
+            return True
+    return False
 
 
 def _find_scale(content: Mapping[str, Any], path: Path) -> tuple[float, ...]:
